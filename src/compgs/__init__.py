@@ -1,0 +1,71 @@
+"""CompGS: compressed Gaussian splatting.
+
+    import compgs
+
+    scene = compgs.load_scene("captures/garden")
+    model = compgs.train(scene, preset="quick")
+    compgs.encode(model, "garden.cgs")
+
+    model = compgs.decode("garden.cgs")
+    result = compgs.render(model, scene.test_views[0].camera)
+
+Names are resolved on first use, so that `import compgs` is instant and decoding never loads the training code.
+"""
+
+import importlib
+import os
+from typing import TYPE_CHECKING
+
+# torch's OpenMP threads spin between parallel regions and take the cores from numba's: a training step
+# costs twice as much. Only has an effect when it is set before torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "load_scene": "compgs.scene",
+    "train": "compgs.training",
+    "encode": "compgs.codec",
+    "decode": "compgs.codec",
+    "render": "compgs.render",
+    "evaluate": "compgs.evaluation",
+    "load_config": "compgs.config",
+    "Camera": "compgs.cameras",
+    "Gaussians": "compgs.gaussians",
+    "CompGSError": "compgs.errors",
+}
+
+__all__ = [
+    "Camera",
+    "CompGSError",
+    "Gaussians",
+    "__version__",
+    "decode",
+    "encode",
+    "evaluate",
+    "load_config",
+    "load_scene",
+    "render",
+    "train",
+]
+
+if TYPE_CHECKING:
+    from compgs.cameras import Camera
+    from compgs.codec import decode, encode
+    from compgs.config import load_config
+    from compgs.errors import CompGSError
+    from compgs.evaluation import evaluate
+    from compgs.gaussians import Gaussians
+    from compgs.render import render
+    from compgs.scene import load_scene
+    from compgs.training import train
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module 'compgs' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

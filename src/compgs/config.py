@@ -1,0 +1,150 @@
+"""Settings: one typed line each, with unit and source. A preset file holds only what differs.
+
+`Config()` is the `default` preset. Schedules are given as fractions of the run, so that a run of 2 000 steps and
+one of 30 000 go through the same phases. "Ref." marks values of the authors' released configuration.
+"""
+
+import dataclasses
+import tomllib
+import typing
+from dataclasses import dataclass, field
+from importlib import resources
+from typing import Any, Literal
+
+from compgs.errors import ConfigError
+
+PRESETS = ("default", "paper", "quick")
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Hybrid primitives and their prediction (Sec. 3.1, 3.2)."""
+
+    coupled_primitives: int = 10  # K, per anchor (Sec. 3.4)
+    reference_dim: int = 32  # channels of a reference embedding (Sec. 3.4)
+    residual_dim: int = 8  # channels of a residual embedding (Sec. 3.4)
+    width: int = 32  # hidden width of the residual MLPs (Ref.)
+    heads: Literal["separate", "paired"] = "paired"  # separate: four networks (Sec. 3.2); paired: geometry, appearance
+    voxel_size: float | None = None  # world units between neighbouring anchors; None: median distance of the points
+    max_anchors: int = 1_000_000  # growth stops here
+
+
+@dataclass(frozen=True)
+class EntropyConfig:
+    """Quantization and rate (Sec. 3.3)."""
+
+    reference_hyper_dim: int = 4  # hyperprior channels of a reference embedding (Ref.)
+    residual_hyper_dim: int = 10  # hyperprior channels of an anchor's K residual embeddings (Ref.)
+    reference_step: float = 1.0  # quantization step of reference embeddings (Sec. 3.4)
+    residual_step: float = 1.0  # quantization step of residual embeddings (Sec. 3.4)
+    covariance_step: float = 0.05  # initial learned step of the anchors' log scales; 0.01 in the paper starts
+    #   on the likelihood floor in short runs
+    network_bits: int = 12  # of the entropy networks' weights in the file
+    head_bits: int = 8  # of the prediction heads' weights in the file
+
+
+@dataclass(frozen=True)
+class ControlConfig:
+    """Adaptive control of the anchors: growth and pruning (Ref.; schedule as fractions of the run)."""
+
+    start: float = 0.15  # of the steps: first control
+    stop: float = 0.5  # of the steps: last control
+    every: float = 0.05  # of the steps between two controls, at least twice the number of views
+    gradient_threshold: float = 1e-4  # mean norm of the 2D gradient, in units of half the image
+    minimum_views: int = 20  # a primitive seen less often is not judged
+    opacity_threshold: float = 5e-4  # anchors with less opacity, summed over K, averaged over views, are removed
+    growth_probability: float = 0.5  # a candidate of level l is kept with probability p^(l + 1)
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Rate-distortion optimization (Sec. 3.4)."""
+
+    steps: int = 30_000  # one view each
+    seed: int = 0
+    lmbda: float = 0.001  # weight of the rate
+    rate: Literal["bits", "elements"] = "bits"  # bits: true bits, normalized so that lambda means the same as in
+    #   the paper; elements: sum over the tensors of mean bits per element (Ref.)
+    rate_start: float = 0.1  # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
+    ssim_weight: float = 0.2  # (1 - w) L1 + w (1 - SSIM) (3DGS)
+    scale_weight: float = 0.01  # mean product of the primitives' scales (Ref.)
+    embedding_lr: tuple[float, float] = (0.04, 3e-4)  # quantization steps per training step, first and last
+    log_scale_lr: tuple[float, float] = (0.007, 0.007)  # Ref.
+    translation_lr: tuple[float, float] = (2e-3, 2e-5)  # Ref.
+    covariance_lr: tuple[float, float] = (4e-3, 4e-5)  # Ref.
+    opacity_lr: tuple[float, float] = (2e-3, 2e-5)  # Ref.
+    color_lr: tuple[float, float] = (8e-3, 8e-5)  # Ref.
+    entropy_lr: tuple[float, float] = (5e-3, 1e-4)  # Ref. 2e-4 -> 1e-5 hardly moves in short runs
+    quantized_weights: float = 0.8  # of the steps before the networks' weights are trained as they will be stored
+    checkpoint_minutes: float = 5.0  # between two checkpoints; one is also written when the run is interrupted
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of a run."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    entropy: EntropyConfig = field(default_factory=EntropyConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+
+    def to_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+def _section(kind: type, values: dict[str, Any], place: str) -> Any:
+    hints = typing.get_type_hints(kind)
+    unknown = sorted(set(values) - set(hints))
+    if unknown:
+        raise ConfigError(f"{place}: unknown setting {unknown[0]!r}; known: {', '.join(sorted(hints))}")
+    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+
+
+def config_from_dict(values: dict[str, Any], place: str = "settings") -> Config:
+    """Inverse of `Config.to_dict`. Raises ConfigError on unknown names or values out of range."""
+    hints = typing.get_type_hints(Config)
+    unknown = sorted(set(values) - set(hints))
+    if unknown:
+        raise ConfigError(f"{place}: unknown section {unknown[0]!r}; known: {', '.join(hints)}")
+    config = Config(**{k: _section(hints[k], v, f"{place}: [{k}]") for k, v in values.items()})
+    check_config(config)
+    return config
+
+
+def load_config(preset: str = "default") -> Config:
+    """The settings of a preset: `default`, `paper` or `quick`. Raises ConfigError for any other name."""
+    if preset not in PRESETS:
+        raise ConfigError(f"preset {preset!r} does not exist; there are {', '.join(PRESETS)}")
+    file = resources.files("compgs.presets") / f"{preset}.toml"
+    return config_from_dict(tomllib.loads(file.read_text(encoding="utf-8")), f"preset {preset}")
+
+
+def check_config(config: Config) -> None:
+    """Raises ConfigError for the first setting that is out of range."""
+    m, e, t, c = config.model, config.entropy, config.training, config.control
+    rules = [
+        ("model.coupled_primitives", 1 <= m.coupled_primitives <= 64, "1 to 64"),
+        ("model.reference_dim", 1 <= m.reference_dim <= 256, "1 to 256"),
+        ("model.residual_dim", 1 <= m.residual_dim <= 64, "1 to 64"),
+        ("model.width", 8 <= m.width <= 256 and m.width % 8 == 0, "a multiple of 8 up to 256"),
+        ("model.heads", m.heads in ("separate", "paired"), "separate or paired"),
+        ("model.voxel_size", m.voxel_size is None or 0 < m.voxel_size < float("inf"), "above 0"),
+        ("model.max_anchors", 1 <= m.max_anchors <= 1 << 24, "1 to 16777216"),
+        ("entropy.reference_hyper_dim", 1 <= e.reference_hyper_dim <= 64, "1 to 64"),
+        ("entropy.residual_hyper_dim", 1 <= e.residual_hyper_dim <= 64, "1 to 64"),
+        ("entropy.reference_step", 0 < e.reference_step < 1e3, "above 0"),
+        ("entropy.residual_step", 0 < e.residual_step < 1e3, "above 0"),
+        ("entropy.covariance_step", 0 < e.covariance_step < 10, "above 0"),
+        ("entropy.network_bits", 6 <= e.network_bits <= 16, "6 to 16"),
+        ("entropy.head_bits", 6 <= e.head_bits <= 16, "6 to 16"),
+        ("training.steps", 1 <= t.steps <= 10_000_000, "1 to 10000000"),
+        ("training.lmbda", 0 <= t.lmbda <= 100, "0 to 100"),
+        ("training.rate", t.rate in ("bits", "elements"), "bits or elements"),
+        ("training.rate_start", 0 <= t.rate_start <= 1, "0 to 1"),
+        ("training.seed", 0 <= t.seed < 1 << 31, "0 to 2147483647"),
+        ("control.every", c.every > 0, "above 0"),
+    ]
+    for name, good, legal in rules:
+        if not good:
+            section, key = name.split(".")
+            raise ConfigError(f"{name} = {getattr(getattr(config, section), key)!r}: expected {legal}")
