@@ -39,6 +39,7 @@ class EntropyConfig:
     residual_step: float = 1.0  # quantization step of residual embeddings (Sec. 3.4)
     covariance_step: float = 0.05  # initial learned step of the anchors' log scales; 0.01 in the paper starts
     #   on the likelihood floor in short runs
+    network_hidden: int = 0  # hidden width of the entropy networks; 0: one linear layer (Ref.)
     network_bits: int = 12  # of the entropy networks' weights in the file
     head_bits: int = 8  # of the prediction heads' weights in the file
 

@@ -1,0 +1,131 @@
+"""The entropy model of the hybrid primitives (CompGS Sec. 3.3, Fig. 4).
+
+`f` reference embeddings, `c` covariance parameters (log scales), `g` residual embeddings of an anchor's K coupled
+primitives, flattened; `z` hyperpriors. All latents are in units of their quantization step, one row per anchor.
+`bits` are total bits of an anchor's row; `losses.py` alone divides them, and says by what.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from compgs.config import EntropyConfig, ModelConfig
+from compgs.entropy.factorized import FactorizedDensity
+from compgs.entropy.gaussian import gaussian_bits
+from compgs.entropy.network import NEGATIVE_SLOPE, EntropyNetwork
+from compgs.entropy.quantization import quantize, round_straight_through, uniform_noise
+
+STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")
+
+# Starting slots are spread over this many steps: identical coupled primitives would stay identical for ever.
+SLOT_SPREAD = 0.4
+# Below this step, the log scales leave the range of the decoder's fixed-point numbers.
+SMALLEST_COVARIANCE_STEP = 0.005
+
+
+class HyperAnalysis(nn.Module):
+    """The encoder's half of a hyperprior: y -> z. It never goes into the file."""
+
+    def __init__(self, inputs: int, channels: int) -> None:
+        super().__init__()
+        self.first = nn.Linear(inputs, channels)
+        self.second = nn.Linear(channels, channels)
+
+    def forward(self, y: Tensor) -> Tensor:
+        return self.second(nn.functional.leaky_relu(self.first(y), NEGATIVE_SLOPE))
+
+
+@dataclass(frozen=True)
+class Quantized:
+    """Latents as the decoder will have them, in quantization steps, and what they cost."""
+
+    references: Tensor  # [N, reference_dim]
+    covariances: Tensor  # [N, 6]
+    residuals: Tensor  # [N, K * residual_dim]
+    bits: dict[str, Tensor]  # stream -> [N] bits per anchor; empty when not asked for
+
+
+class EntropyModel(nn.Module):
+    """Hyperpriors for the embeddings, the reference as context for everything else (CompGS Sec. 3.3).
+
+        f ──analysis──► z_f ──► (mean, scale) of f
+        f_hat ──► (mean, scale) of c
+        g ──analysis──► z_g ┐
+        f_hat ──────────────┴──► (mean, scale) of g
+    """
+
+    def __init__(self, model: ModelConfig, entropy: EntropyConfig) -> None:
+        super().__init__()
+        residuals = model.coupled_primitives * model.residual_dim
+        hidden = entropy.network_hidden
+        self.reference_analysis = HyperAnalysis(model.reference_dim, entropy.reference_hyper_dim)
+        self.reference_density = FactorizedDensity(entropy.reference_hyper_dim)
+        self.reference_network = EntropyNetwork(entropy.reference_hyper_dim, model.reference_dim, hidden)
+        # Log scales span a few natural units, that is dozens of steps.
+        self.covariance_network = EntropyNetwork(model.reference_dim, 6, hidden, 1.0 / entropy.covariance_step)
+        self.residual_analysis = HyperAnalysis(residuals, entropy.residual_hyper_dim)
+        self.residual_density = FactorizedDensity(entropy.residual_hyper_dim)
+        self.residual_network = EntropyNetwork(
+            entropy.residual_hyper_dim + model.reference_dim, residuals, hidden
+        )
+        self.log_covariance_step = nn.Parameter(torch.tensor(entropy.covariance_step).log())
+        with torch.no_grad():
+            self.residual_network.biases[-1][:residuals].uniform_(-SLOT_SPREAD, SLOT_SPREAD)
+
+    @property
+    def covariance_step(self) -> Tensor:
+        """s_Sigma: learned quantization step of the log scales (Sec. 3.4)."""
+        return self.log_covariance_step.exp().clamp_min(SMALLEST_COVARIANCE_STEP)
+
+    @torch.no_grad()
+    def fit_covariance_prior(self, log_scales: Tensor) -> None:
+        """Start the covariance prior at the data's mean and spread: from zero it would start without gradient."""
+        network, step = self.covariance_network, self.covariance_step
+        network.weights[-1].mul_(0.1)
+        network.biases[-1][:6] = log_scales.mean() / (step * network.gain[0])
+        network.biases[-1][6:] = (log_scales.std().clamp_min(0.1) / step).log2()
+
+    def starting_residuals(self) -> Tensor:
+        """[K * residual_dim] residual embedding that a new anchor starts with, in quantization steps."""
+        channels = self.residual_network.channels
+        return self.residual_network.biases[-1].detach()[:channels].clone()
+
+    def forward(
+        self,
+        references: Tensor,  # [N, reference_dim] steps
+        covariances: Tensor,  # [N, 6] log scales over the covariance step
+        residuals: Tensor,  # [N, K * residual_dim] steps
+        *,
+        rate: bool,
+        noise: torch.Generator | None = None,
+        network_bits: int | None = None,
+    ) -> Quantized:
+        """Quantize, and estimate the bits if `rate`.
+
+        With `noise` the likelihood sees uniform noise (training), without it the symbols themselves (the size of the
+        file). `network_bits`: the networks' weights as the file will hold them.
+        """
+        z_f = self.reference_analysis(references)
+        mean_f, scale_f = self.reference_network(round_straight_through(z_f), network_bits)
+        f_hat = quantize(references, mean_f)
+        mean_c, scale_c = self.covariance_network(f_hat, network_bits)
+        c_hat = quantize(covariances, mean_c)
+        z_g = self.residual_analysis(residuals)
+        context = torch.cat([round_straight_through(z_g), f_hat], 1)
+        mean_g, scale_g = self.residual_network(context, network_bits)
+        g_hat = quantize(residuals, mean_g)
+        bits: dict[str, Tensor] = {}
+        if rate:
+            bits = {
+                "reference_hyper": self.reference_density.bits(_relax(z_f, noise)),
+                "reference": gaussian_bits(_relax(references - mean_f, noise), scale_f),
+                "covariance": gaussian_bits(_relax(covariances - mean_c, noise), scale_c),
+                "residual_hyper": self.residual_density.bits(_relax(z_g, noise)),
+                "residual": gaussian_bits(_relax(residuals - mean_g, noise), scale_g),
+            }
+        return Quantized(f_hat, c_hat, g_hat, bits)
+
+
+def _relax(x: Tensor, noise: torch.Generator | None) -> Tensor:
+    return x.round() if noise is None else x + uniform_noise(x, noise)

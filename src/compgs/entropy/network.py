@@ -1,0 +1,65 @@
+"""The trainable twin of the codec's integer networks."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from compgs.entropy.quantization import quantize_weight
+
+# A power of two, so that the decoder's leaky ReLU is a shift.
+NEGATIVE_SLOPE = 2.0**-6
+# The scale outputs are octaves around one quantization step; the codec's tables hold twelve scales an octave, number
+# 60 being one step (entropy.gaussian).
+OCTAVE = 12.0
+UNIT_SCALE = 60.0
+
+
+class EntropyNetwork(nn.Module):
+    """Means and scale indices of C Gaussian-distributed symbols from already decoded latents (CompGS Sec. 3.3).
+
+        x [N, inputs] ─► linear ─► (leaky ReLU ─► linear) ... ─► mean [N, C], scale index [N, C]
+
+    `mean_gain` sets the unit in which the means are learned, so that one learning rate serves embeddings (means of
+    a few steps) and log scales (means of dozens of steps). Gains are folded into the last layer: `layers` gives the
+    weights that the file will hold.
+    """
+
+    gain: Tensor
+    offset: Tensor
+
+    def __init__(self, inputs: int, channels: int, hidden: int = 0, mean_gain: float = 1.0) -> None:
+        super().__init__()
+        sizes = [inputs, hidden, 2 * channels] if hidden else [inputs, 2 * channels]
+        self.channels = channels
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
+            bound = 1.0 / math.sqrt(n_in)
+            self.weights.append(nn.Parameter(torch.empty(n_out, n_in).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(torch.zeros(n_out)))
+        gain = torch.full((2 * channels,), mean_gain)
+        gain[channels:] = OCTAVE
+        offset = torch.zeros(2 * channels)
+        offset[channels:] = UNIT_SCALE
+        self.register_buffer("gain", gain)
+        self.register_buffer("offset", offset)
+
+    def layers(self, bits: int | None = None) -> list[tuple[Tensor, Tensor]]:
+        """Effective (weight [out, in], bias [out]) of each layer; rounded to `bits` bits if given."""
+        result = []
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            if i == len(self.weights) - 1:
+                weight = weight * self.gain[:, None]
+                bias = bias * self.gain + self.offset
+            result.append((weight if bits is None else quantize_weight(weight, bits), bias))
+        return result
+
+    def forward(self, x: Tensor, bits: int | None = None) -> tuple[Tensor, Tensor]:
+        """x [N, inputs] -> means [N, C] in quantization steps, scale indices [N, C] (see entropy.gaussian)."""
+        layers = self.layers(bits)
+        for i, (weight, bias) in enumerate(layers):
+            x = torch.addmm(bias, x, weight.t())
+            if i < len(layers) - 1:
+                x = nn.functional.leaky_relu(x, NEGATIVE_SLOPE)
+        return x[:, : self.channels], x[:, self.channels :]

@@ -1,0 +1,134 @@
+"""Inter-primitive prediction (CompGS Sec. 3.2): anchors and residuals in, Gaussians out.
+
+`f` reference embedding of an anchor, `g_k` residual embedding of a coupled primitive, `v` view embedding of an anchor
+(unit direction from the camera, distance). The four networks of the paper,
+
+    t_k = phi(f, g_k)    S_k = psi(f, g_k), R_k = varphi(f, g_k)    alpha_k = kappa(v, f, g_k)    c_k = zeta(v, f, g_k)
+
+are either separate, or paired into one for geometry and one for appearance, which halves weights and time.
+Opacity is predicted first: a coupled primitive that is not seen needs nothing else.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from compgs.gaussians import Gaussians
+from compgs.model.layers import ResidualMLP
+from compgs.model.primitives import Primitives
+
+VIEW_DIM = 4  # unit direction (3) and distance (1)
+OPACITY_CUTOFF = 1.0 / 255.0  # a splat below it touches no pixel in any rasterizer
+OPACITY_BIAS = 0.15  # where opacity starts at or below zero no gradient flows
+
+
+class PredictionHeads(nn.Module):
+    """The prediction networks. `layout` is "separate" (four networks, the paper) or "paired" (two)."""
+
+    def __init__(self, reference_dim: int, residual_dim: int, width: int, layout: str) -> None:
+        super().__init__()
+        self.layout = layout
+        seen = reference_dim + VIEW_DIM
+        if layout == "paired":
+            self.geometry = ResidualMLP(reference_dim, residual_dim, 10, width, blocks=1)
+            self.appearance = ResidualMLP(seen, residual_dim, 4, width, blocks=1)
+        else:
+            self.translation = ResidualMLP(reference_dim, residual_dim, 3, width, blocks=1)
+            self.covariance = ResidualMLP(reference_dim, residual_dim, 7, width, blocks=1)
+            self.opacity = ResidualMLP(seen, residual_dim, 1, width, blocks=1)
+            self.color = ResidualMLP(seen, residual_dim, 3, width, blocks=2)
+        with torch.no_grad():
+            opacity = self.appearance if layout == "paired" else self.opacity
+            opacity.output_bias[0] = OPACITY_BIAS
+
+    def forward(self, kind: str, *args: Tensor) -> Tensor:
+        """One of `predict_opacity`, `predict_color`, ... by name, so that torch.func.functional_call reaches them."""
+        return getattr(self, f"predict_{kind}")(*args)
+
+    def predict_appearance(self, anchors: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
+        """Of all coupled primitives: [P, 4] raw opacity and color (paired), or [P, 1] raw opacity (separate)."""
+        return (self.appearance if self.layout == "paired" else self.opacity)(anchors, residuals, index)
+
+    def predict_color(self, anchors: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
+        """Of visible coupled primitives: [M, 3] raw color (separate only)."""
+        return self.color(anchors, residuals, index)
+
+    def predict_geometry(self, anchors: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
+        """Of visible coupled primitives: [M, 10] translation, scaling, quaternion."""
+        if self.layout == "paired":
+            return self.geometry(anchors, residuals, index)
+        translation = self.translation(anchors, residuals, index)
+        return torch.cat([translation, self.covariance(anchors, residuals, index)], 1)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Gaussians of one view, and where they come from."""
+
+    gaussians: Gaussians  # M primitives
+    index: Tensor  # [M] int64, ascending: which coupled primitives (of P) they are
+    opacities: Tensor  # [P] of all coupled primitives; not above 0: not drawn
+
+
+def view_embedding(positions: Tensor, camera_center: Tensor, distance_unit: float) -> Tensor:
+    """[N, 4]: unit direction from the camera to the anchor, and distance in `distance_unit` world units (Sec. 3.2)."""
+    offset = positions - camera_center
+    distance = offset.norm(dim=1, keepdim=True)
+    return torch.cat([offset / distance.clamp_min(1e-12), distance / distance_unit], 1)
+
+
+def affine_transform(
+    raw: Tensor,  # [M, 10] output of the geometry network
+    positions: Tensor,  # [M, 3] of the anchors, world units
+    offset_scales: Tensor,  # [M, 3] world units
+    sizes: Tensor,  # [M, 3] world units
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Means, scales [M, 3] and quaternions [M, 4] of coupled primitives (Eq. 2 and 4).
+
+    mean_k = mean + t_k * offset_scale, covariance_k = R_k S_k Sigma S_k R_k^T with Sigma = diag(sizes)^2 and
+    0 < S_k < 1. As printed, S_k R_k Sigma is not symmetric and so no covariance: docs/paper_map.md.
+    """
+    means = positions + raw[:, :3] * offset_scales
+    scales = torch.sigmoid(raw[:, 3:6]) * sizes
+    # An identity offset keeps the norm away from zero, where the direction has no gradient.
+    identity = raw.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return means, scales, raw[:, 6:10] + identity
+
+
+def predict(
+    heads: PredictionHeads,
+    primitives: Primitives,
+    camera_center: Tensor,  # [3] world units
+    distance_unit: float,  # world units
+    weights: dict[str, Tensor] | None = None,
+) -> Prediction:
+    """Gaussians of all coupled primitives that can be seen from a camera (Sec. 3.2).
+
+    `weights`: other parameter values for the heads (as they will be stored), by name.
+    """
+
+    def call(kind: str, anchors: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
+        if weights is None:
+            return heads(kind, anchors, residuals, index)
+        return torch.func.functional_call(heads, weights, (kind, anchors, residuals, index))
+
+    view = view_embedding(primitives.positions, camera_center, distance_unit)
+    seen = torch.cat([primitives.references, view], 1)
+    raw = call("appearance", seen, primitives.residuals, primitives.anchor_index)
+    opacities = torch.tanh(raw[:, 0])
+    index = torch.nonzero(opacities.detach() > OPACITY_CUTOFF).view(-1)
+    anchor = primitives.anchor_index[index]
+    residuals = primitives.residuals.index_select(0, index)
+    if heads.layout == "paired":
+        color = raw.index_select(0, index)[:, 1:4]
+    else:
+        color = call("color", seen, residuals, anchor)
+    means, scales, quaternions = affine_transform(
+        call("geometry", primitives.references, residuals, anchor),
+        primitives.positions.index_select(0, anchor),
+        primitives.offset_scales.index_select(0, anchor),
+        primitives.sizes.index_select(0, anchor),
+    )
+    gaussians = Gaussians(means, quaternions, scales, opacities.index_select(0, index), torch.sigmoid(color))
+    return Prediction(gaussians, index, opacities)

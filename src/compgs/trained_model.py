@@ -1,0 +1,131 @@
+"""The trainable scene: anchors' parameters, prediction heads and entropy model in one module.
+
+Training optimizes it, the encoder turns it into a file, `as_hybrid_model` into something that can be rendered.
+"""
+
+import copy
+
+import torch
+from torch import Tensor, nn
+
+from compgs.config import Config
+from compgs.entropy.models import EntropyModel, Quantized
+from compgs.entropy.quantization import quantize_weight
+from compgs.model.hybrid_model import HybridModel
+from compgs.model.prediction import PredictionHeads
+from compgs.model.primitives import Primitives, every_slot
+
+# Biases are few: they keep more bits than the weights.
+BIAS_BITS = 14
+
+
+class TrainedModel(nn.Module):
+    """N anchors on a voxel grid with K coupled primitives each.
+
+    Embeddings are kept in units of their quantization step, so that a learning rate is a number of steps; log scales
+    in natural units relative to the voxel size.
+    """
+
+    coordinates: Tensor  # [N, 3] int32, voxels
+    mask: Tensor  # [N, K] bool: coupled primitives that exist
+
+    def __init__(
+        self,
+        config: Config,
+        coordinates: Tensor,  # [N, 3] int32
+        voxel_size: float,  # world units
+        distance_unit: float,  # world units, of the view embedding
+        background: tuple[float, float, float],
+    ) -> None:
+        super().__init__()
+        m = config.model
+        n = len(coordinates)
+        self.config = config
+        self.voxel_size = voxel_size
+        self.distance_unit = distance_unit
+        self.background = background
+        self.heads = PredictionHeads(m.reference_dim, m.residual_dim, m.width, m.heads)
+        self.entropy = EntropyModel(m, config.entropy)
+        self.register_buffer("coordinates", coordinates.to(torch.int32))
+        self.register_buffer("mask", torch.ones(n, m.coupled_primitives, dtype=torch.bool))
+        self.log_scales = nn.Parameter(torch.zeros(n, 6))
+        self.references = nn.Parameter(torch.zeros(n, m.reference_dim))
+        self.residuals = nn.Parameter(self.entropy.starting_residuals().repeat(n, 1))
+
+    @property
+    def anchors(self) -> int:
+        return len(self.coordinates)
+
+    @property
+    def device(self) -> torch.device:
+        return self.log_scales.device
+
+    def positions(self, rows: Tensor | None = None) -> Tensor:
+        """[N, 3] float32 world units, of the given anchors or all."""
+        coordinates = self.coordinates if rows is None else self.coordinates[rows]
+        return coordinates.to(torch.float32) * self.voxel_size
+
+    def quantized(
+        self,
+        rows: Tensor | None = None,  # [V] int64: anchors to look at; default all
+        *,
+        rate: bool = False,
+        noise: torch.Generator | None = None,
+        stored_weights: bool = True,
+    ) -> Quantized:
+        """Quantized latents (in steps) and their bits; see EntropyModel.forward."""
+        if rows is None:
+            references, log_scales, residuals = self.references, self.log_scales, self.residuals
+        else:
+            references = self.references.index_select(0, rows)
+            log_scales = self.log_scales.index_select(0, rows)
+            residuals = self.residuals.index_select(0, rows)
+        bits = self.config.entropy.network_bits if stored_weights else None
+        return self.entropy(
+            references, log_scales / self.entropy.covariance_step, residuals, rate=rate, noise=noise, network_bits=bits
+        )
+
+    def primitives(self, latents: Quantized, rows: Tensor | None = None) -> Primitives:
+        """Dequantize: all K coupled primitives of the given anchors, as prediction sees them."""
+        e, m = self.config.entropy, self.config.model
+        n = len(latents.references)
+        return Primitives(
+            positions=self.positions(rows),
+            log_scales=latents.covariances * self.entropy.covariance_step,
+            references=latents.references * e.reference_step,
+            residuals=(latents.residuals * e.residual_step).view(n * m.coupled_primitives, m.residual_dim),
+            anchor_index=every_slot(n, m.coupled_primitives, self.device),
+            voxel_size=self.voxel_size,
+        )
+
+    def stored_head_weights(self) -> dict[str, Tensor]:
+        """The heads' parameters as the file will hold them, by name, straight-through."""
+        bits = self.config.entropy.head_bits
+        return {
+            name: quantize_weight(p, bits if p.dim() > 1 else BIAS_BITS) for name, p in self.heads.named_parameters()
+        }
+
+    @torch.no_grad()
+    def as_hybrid_model(self, *, stored_weights: bool = True) -> HybridModel:
+        """What a decoder would render, without going through a file."""
+        primitives = self.primitives(self.quantized(stored_weights=stored_weights))
+        kept = self.mask.view(-1)
+        heads = copy.deepcopy(self.heads)
+        if stored_weights:
+            for name, value in self.stored_head_weights().items():
+                heads.get_parameter(name).copy_(value)
+        chosen = Primitives(
+            primitives.positions,
+            primitives.log_scales,
+            primitives.references,
+            primitives.residuals[kept],
+            primitives.anchor_index[kept],
+            primitives.voxel_size,
+        )
+        return HybridModel(chosen, heads.requires_grad_(False), self.distance_unit, self.background)
+
+    @torch.no_grad()
+    def estimated_bits(self) -> dict[str, float]:
+        """Bits of each stream of the file, by the model's own probabilities (weights and positions not included)."""
+        bits = self.quantized(rate=True).bits
+        return {name: float(b.sum(dtype=torch.float64)) for name, b in bits.items()}
