@@ -1,0 +1,150 @@
+"""What was captured: `load_scene` finds the layout of a folder and reads views, poses and points."""
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from compgs.errors import ConfigError, MissingSparseModel, SceneError
+from compgs.scene.blender import read_blender
+from compgs.scene.capture import Capture, PosedImage
+from compgs.scene.colmap import find_sparse_model
+from compgs.scene.colmap_capture import read_colmap
+from compgs.scene.images import Progress, image_size, load_views
+from compgs.scene.nerfstudio import read_nerfstudio
+from compgs.scene.points import MIN_POINTS, fallback_points
+from compgs.scene.views import Points, Scene, View, scene_extent
+
+__all__ = ["Points", "Scene", "View", "load_scene"]
+
+FALLBACK_POINTS = 20_000  # random points of a scene without sparse points
+
+
+def load_scene(
+    path: str | Path,
+    *,
+    downscale: int = 1,  # images at 1 / downscale of their size
+    images: str = "images",  # folder of the images, inside the scene's (COLMAP)
+    test_every: int = 8,  # every n-th of the name-sorted views is held out, the first included
+    holdout: bool = True,  # False: all views are trained on
+    background: tuple[float, float, float] | None = None,  # display RGB, 0 to 1; None: the layout's
+    progress: Progress | None = None,  # called with (done, total) views
+) -> Scene:
+    """Reads a capture of COLMAP (binary or text), Blender (`transforms_train.json`) or nerfstudio (`transforms.json`).
+
+    Raises SceneError or one of its kinds for missing, damaged or contradicting data, ConfigError for settings.
+    """
+    if downscale < 1 or int(downscale) != downscale:
+        raise ConfigError(f"downscale {downscale}: expected a whole number from 1")
+    if test_every < 2:
+        raise ConfigError(f"test_every {test_every}: expected at least 2, so that views are left to train on")
+    if background is not None and not (len(background) == 3 and all(0 <= c <= 1 for c in background)):
+        raise ConfigError(f"background {background}: expected three numbers from 0 to 1")
+    folder = Path(path)
+    capture = _read_layout(folder, images)
+    _check_views(capture, folder)
+    capture, downscale = _prescaled(capture, folder, images, downscale)
+
+    behind = background or capture.background
+    views = load_views(capture.images, downscale, behind, progress)
+    held_out = _held_out(capture, test_every) if holdout else frozenset()
+    points, notes = _enough_points(capture, views)
+    return Scene(
+        name=folder.resolve().name,
+        train_views=tuple(v for v in views if v.name not in held_out),
+        test_views=tuple(v for v in views if v.name in held_out),
+        points=points,
+        background=behind,
+        extent=_extent(views, points),
+        source=folder,
+        notes=capture.notes + notes,
+    )
+
+
+def _read_layout(folder: Path, images: str) -> Capture:
+    if not folder.is_dir():
+        what = "is a file" if folder.exists() else "does not exist"
+        raise SceneError(f"{folder}: {what}; expected the folder of a scene")
+    if not any(folder.iterdir()):
+        raise SceneError(f"{folder}: the folder is empty; expected the folder of a scene")
+    sparse = find_sparse_model(folder)
+    if sparse is not None:
+        capture = read_colmap(folder, sparse, folder / images)
+    elif (folder / "transforms_train.json").is_file():
+        capture = read_blender(folder)
+    elif (folder / "transforms.json").is_file():
+        capture = read_nerfstudio(folder)
+    else:
+        raise MissingSparseModel(
+            f"{folder}: no camera poses found; expected a COLMAP sparse model (cameras.bin, images.bin and "
+            f"points3D.bin in sparse/0), transforms_train.json (Blender) or transforms.json (nerfstudio). For "
+            f"photographs alone, run: colmap automatic_reconstructor --workspace_path {folder} "
+            f"--image_path {folder / images}"
+        )
+    return replace(capture, images=tuple(sorted(capture.images, key=lambda posed: posed.name)))
+
+
+def _check_views(capture: Capture, folder: Path) -> None:
+    names = [posed.name for posed in capture.images]
+    for name, following in itertools.pairwise(names):
+        if name == following:
+            raise SceneError(f"{folder}: the view {name!r} has more than one pose; remove the others")
+    if len(names) < 2:
+        raise SceneError(f"{folder}: {len(names)} view with a pose; a scene needs at least 2")
+
+
+def _prescaled(capture: Capture, folder: Path, images: str, downscale: int) -> tuple[Capture, int]:
+    """Takes the images from `images_<downscale>` where that folder has all of them in the promised size."""
+    smaller = folder / f"{images}_{downscale}"
+    if downscale == 1 or not smaller.is_dir():
+        return capture, downscale
+    swapped = []
+    for posed in capture.images:
+        if not posed.path.is_relative_to(folder / images):
+            return capture, downscale
+        path = smaller / posed.path.relative_to(folder / images)
+        if not path.is_file() or not _is_smaller_copy(posed, path, downscale):
+            note = (
+                f"{smaller.name} is not used: {path.name} is missing there or not 1/{downscale} of its size"
+            )
+            return replace(capture, notes=(*capture.notes, note)), downscale
+        swapped.append(replace(posed, path=path))
+    return replace(capture, images=tuple(swapped)), 1
+
+
+def _is_smaller_copy(posed: PosedImage, path: Path, downscale: int) -> bool:
+    width, height = image_size(path)
+    camera = posed.camera
+    return abs(width - camera.width / downscale) <= 1 and abs(height - camera.height / downscale) <= 1
+
+
+def _held_out(capture: Capture, test_every: int) -> frozenset[str]:
+    if capture.test_names is not None:
+        return capture.test_names
+    return frozenset(posed.name for posed in capture.images[::test_every])
+
+
+def _enough_points(capture: Capture, views: list[View]) -> tuple[Points, tuple[str, ...]]:
+    found = len(capture.points)
+    if found >= MIN_POINTS:
+        return capture.points, ()
+    random = fallback_points([view.camera for view in views], FALLBACK_POINTS)
+    both = Points(
+        np.concatenate([capture.points.positions, random.positions]),
+        np.concatenate([capture.points.colors, random.colors]),
+    )
+    note = (
+        f"{capture.points_source} has {found} points, too few to start from: {len(random)} random ones were added "
+        f"where the cameras look"
+    )
+    return both, (note,)
+
+
+def _extent(views: list[View], points: Points) -> float:
+    centers = np.stack([view.camera.center for view in views])
+    extent = scene_extent(centers)
+    if extent > 1e-6 * float(np.abs(centers).max(initial=1e-30)):
+        return extent
+    # all views from one place: the distance of the points is the only length there is
+    return float(np.median(np.linalg.norm(points.positions - centers.mean(axis=0), axis=1)))

@@ -1,0 +1,51 @@
+"""What the reader of every layout hands over: where the images lie and how they were taken, no pixels yet."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from compgs.cameras import Camera
+from compgs.errors import UnsupportedCamera
+from compgs.scene.undistort import Distortion
+from compgs.scene.views import Points
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image on disk with its camera, at the size that the camera was calibrated for."""
+
+    name: str
+    path: Path
+    camera: Camera
+    distortion: Distortion | None = None  # None: the image is a pinhole image already
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A scene of which no pixel has been read yet."""
+
+    images: tuple[PosedImage, ...]
+    test_names: frozenset[str] | None  # names of the held-out views; None: the layout does not say
+    points: Points
+    points_source: str  # the file of the points, for messages
+    background: tuple[float, float, float]  # what the layout's images stand on by default
+    notes: tuple[str, ...] = ()
+
+
+def check_camera(camera: Camera, place: str) -> None:
+    """Raises UnsupportedCamera where intrinsics or pose cannot be used; `place` names file and view."""
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    if camera.width < 1 or camera.height < 1 or max(camera.width, camera.height) > 1 << 20:
+        raise UnsupportedCamera(
+            f"{place}: an image size of {camera.width}x{camera.height} pixels makes no sense"
+        )
+    if not np.isfinite(intrinsics).all() or camera.fx <= 0 or camera.fy <= 0:
+        raise UnsupportedCamera(
+            f"{place}: focal lengths must be above 0 and finite, found fx {camera.fx}, fy {camera.fy}, "
+            f"cx {camera.cx}, cy {camera.cy}; calibrate again"
+        )
+    if not np.isfinite(camera.world_to_camera).all():
+        raise UnsupportedCamera(
+            f"{place}: the pose is not finite; remove the image from the model or register it again"
+        )

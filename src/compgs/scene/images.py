@@ -1,0 +1,165 @@
+"""Photographs from disk: checked against their cameras, composited, undistorted, resized, kept as uint8."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import replace
+from pathlib import Path
+from threading import Lock
+from typing import TypeVar
+
+import numpy as np
+from PIL import Image
+
+from compgs.cameras import Camera
+from compgs.errors import SceneError, UnreadableImage
+from compgs.scene.capture import PosedImage
+from compgs.scene.undistort import sample_bicubic, undistorted_camera, undistortion_map
+from compgs.scene.views import View
+
+# What Pillow raises for damaged files, besides OSError
+_DAMAGED = (OSError, ValueError, SyntaxError, EOFError, IndexError, MemoryError, Image.DecompressionBombError)
+
+Progress = Callable[[int, int], None]  # done, total
+_Result = TypeVar("_Result")
+
+
+def image_size(file: Path) -> tuple[int, int]:
+    """(width, height) in pixels, from the header alone. Raises UnreadableImage."""
+    try:
+        with Image.open(file) as image:
+            return image.size
+    except _DAMAGED as error:
+        raise UnreadableImage(_reason(file, error)) from error
+
+
+def load_views(
+    images: Sequence[PosedImage],
+    downscale: int,
+    background: tuple[float, float, float],
+    progress: Progress | None = None,
+) -> list[View]:
+    """The views at 1 / downscale of their images' size, in the given order. Everything is checked."""
+    cameras = _checked_cameras(images)
+    maps = _Maps()
+
+    def load(index: int) -> View:
+        posed, camera = images[index], cameras[index]
+        pixels = read_image(posed.path, background)
+        if posed.distortion is not None and not posed.distortion.is_identity:
+            camera, positions = maps.get(replace(posed, camera=camera))
+            pixels = sample_bicubic(pixels, positions)
+        width, height = downscaled_size((camera.width, camera.height), downscale)
+        if (width, height) != (camera.width, camera.height):
+            pixels = np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+        return View(posed.name, camera.resized(width, height), np.ascontiguousarray(pixels))
+
+    return _in_threads(load, len(images), progress)
+
+
+def downscaled_size(size: tuple[int, int], downscale: int) -> tuple[int, int]:
+    """(width, height) of an image at 1 / downscale of its size, rounded to whole pixels."""
+    return max(1, round(size[0] / downscale)), max(1, round(size[1] / downscale))
+
+
+def read_image(file: Path, background: tuple[float, float, float]) -> np.ndarray:
+    """[H, W, 3] uint8 RGB; transparent images are composited on the background. Raises UnreadableImage.
+
+    The orientation tag is ignored, as structure from motion ignores it: poses belong to the stored pixels.
+    """
+    try:
+        with Image.open(file) as image:
+            image.load()
+            return _rgb(image, background)
+    except _DAMAGED as error:
+        raise UnreadableImage(_reason(file, error)) from error
+
+
+def _rgb(image: Image.Image, background: tuple[float, float, float]) -> np.ndarray:
+    if image.mode.startswith("I") or image.mode == "F":  # 16 bits per sample, gray
+        gray = np.asarray(image).astype(np.float64)
+        eight = np.clip(np.round(gray / 257), 0, 255).astype(np.uint8)
+        return np.repeat(eight[:, :, None], 3, axis=2)
+    if "A" in image.getbands() or "transparency" in image.info:
+        rgba = np.asarray(image.convert("RGBA")).astype(np.float32)
+        alpha = rgba[:, :, 3:] / 255
+        behind = np.asarray(background, dtype=np.float32) * 255
+        return np.round(rgba[:, :, :3] * alpha + behind * (1 - alpha)).astype(np.uint8)
+    return np.array(image.convert("RGB"))
+
+
+def _checked_cameras(images: Sequence[PosedImage]) -> list[Camera]:
+    """The cameras at the sizes of the files. Raises for missing or unreadable files and for wrong sizes."""
+    missing = [posed for posed in images if not posed.path.is_file()]
+    if missing:
+        raise UnreadableImage(
+            f"{missing[0].path}: this view's image does not exist{_more(len(missing) - 1, 'missing')}; "
+            f"put the images there, or name their folder with --images"
+        )
+    sizes = _in_threads(lambda index: image_size(images[index].path), len(images), None)
+    wrong = [i for i, posed in enumerate(images) if not fits(sizes[i], posed.camera)]
+    if wrong:
+        posed, (width, height) = images[wrong[0]], sizes[wrong[0]]
+        raise UnreadableImage(
+            f"{posed.path}: the image has {width}x{height} pixels, but its camera was calibrated for "
+            f"{posed.camera.width}x{posed.camera.height}{_more(len(wrong) - 1, 'of the wrong size')}; "
+            f"use the images that the poses were computed from, or a uniformly smaller copy of them"
+        )
+    return [posed.camera.resized(*size) for posed, size in zip(images, sizes, strict=True)]
+
+
+def fits(size: tuple[int, int], camera: Camera) -> bool:
+    """True if an image of that size is the camera's, scaled by one factor up to the rounding of each side."""
+    across, down = size[0] / camera.width, size[1] / camera.height
+    return abs(across - down) <= 1 / camera.width + 1 / camera.height
+
+
+class _Maps:
+    """Undistortion maps, made once per lens and size: the views of a capture mostly share one."""
+
+    def __init__(self) -> None:
+        self.lock = Lock()
+        self.known: dict[tuple, tuple[Camera, np.ndarray]] = {}
+
+    def get(self, posed: PosedImage) -> tuple[Camera, np.ndarray]:
+        assert posed.distortion is not None
+        camera = posed.camera
+        key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, posed.distortion)
+        with self.lock:
+            if key not in self.known:
+                target = undistorted_camera(camera, posed.distortion)
+                self.known[key] = target, undistortion_map(camera, target, posed.distortion)
+            target, positions = self.known[key]
+        return replace(target, world_to_camera=camera.world_to_camera), positions
+
+
+def _in_threads(work: Callable[[int], _Result], count: int, progress: Progress | None) -> list[_Result]:
+    """[work(0), work(1), ...]. Of all the images' errors the first is raised; it says how many more there are."""
+    results: dict[int, _Result] = {}
+    errors: dict[int, SceneError] = {}
+    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+        futures = {pool.submit(work, index): index for index in range(count)}
+        try:
+            for done, future in enumerate(as_completed(futures), start=1):
+                try:
+                    results[futures[future]] = future.result()
+                except SceneError as error:
+                    errors[futures[future]] = error
+                if progress is not None:
+                    progress(done, count)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    if errors:
+        first = errors[min(errors)]
+        raise type(first)(f"{first}{_more(len(errors) - 1, 'unreadable')}") from first
+    return [results[index] for index in range(count)]
+
+
+def _more(count: int, what: str) -> str:
+    return f" ({count} more {'is' if count == 1 else 'are'} {what})" if count else ""
+
+
+def _reason(file: Path, error: BaseException) -> str:
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return f"{file}: the image cannot be read ({reason}); restore it, or remove the view from the poses"

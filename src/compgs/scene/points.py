@@ -1,0 +1,89 @@
+"""From sparse points to anchors: the voxel grid, its size, and points for scenes that have none."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from compgs.cameras import Camera
+from compgs.errors import ConfigError
+from compgs.scene.views import Points
+
+MIN_POINTS = 100  # with fewer, structure from motion says too little of the scene to start from
+COORDINATE_BITS = 21  # signed range of a coordinate: what the position coder represents
+
+
+def voxel_grid(points: Points, voxel_size: float | None = None) -> tuple[np.ndarray, float]:
+    """([N, 3] int32 unique coordinates in voxels, voxel size in world units): one voxel for all points in it.
+
+    coordinate = round(position / voxel size) (CompGS Sec. 3.4). Without a voxel size it is the points' median
+    distance to their nearest neighbour (`median_spacing`). Raises ConfigError where coordinates would leave
+    their range.
+    """
+    positions = points.positions.astype(np.float64)
+    size = median_spacing(positions) if voxel_size is None else float(voxel_size)
+    if not (0 < size < float("inf")):
+        raise ConfigError(f"voxel size {size}: expected above 0 and finite")
+    scaled = np.round(positions / size)
+    limit = (1 << (COORDINATE_BITS - 1)) - 1
+    largest = float(np.abs(scaled).max(initial=0.0))
+    if voxel_size is None and largest > limit:
+        # a few points very far away: the grid becomes as coarse as they need
+        size *= largest / limit * (1 + 1e-6)
+        scaled = np.round(positions / size)
+    elif largest > limit:
+        raise ConfigError(
+            f"voxel size {size:g}: the points reach {np.abs(positions).max():g} world units from the origin, "
+            f"which is {largest:.0f} voxels, but coordinates end at {limit}; use a voxel size of at least "
+            f"{np.abs(positions).max() / limit:.3g}"
+        )
+    return np.unique(scaled.astype(np.int32), axis=0), size
+
+
+def median_spacing(positions: np.ndarray) -> float:  # positions: [P, 3] world units
+    """The median distance of a point to its nearest neighbour; copies of a point count as one. World units.
+
+    The median does not mind outliers, far background or dense clusters of less than half of the points.
+    """
+    unique = np.unique(positions, axis=0)
+    if len(unique) < 2:
+        return 1.0
+    distances, _ = cKDTree(unique).query(unique, k=2)
+    return float(np.median(distances[:, 1]))
+
+
+def fallback_points(cameras: Sequence[Camera], count: int, seed: int = 0) -> Points:
+    """Random gray points where the cameras look, for scenes whose sparse points are too few.
+
+    Each point lies at a random pixel of a random camera. Its depth is drawn around the distance of the point that
+    all cameras look at (closest to their axes), or, where they look apart, around the size of their path.
+    """
+    rng = np.random.default_rng(seed)
+    centers = np.stack([camera.center for camera in cameras])
+    forward = np.stack([camera.rotation[2] for camera in cameras])
+    focus = _closest_to_axes(centers, forward)
+    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()) or 1.0
+    depths = ((focus - centers) * forward).sum(axis=1)
+    depths = np.where(depths > 0.1 * spread, depths, 2 * spread)
+    chosen = rng.integers(len(cameras), size=count)
+    pixels = rng.random((count, 2))
+    # most between half and one and a half times the distance of the focus
+    depth = depths[chosen] * rng.triangular(0.4, 1.0, 1.6, size=count)
+    positions = np.empty((count, 3))
+    for index, camera in enumerate(cameras):
+        mine = chosen == index
+        u, v = pixels[mine, 0] * camera.width, pixels[mine, 1] * camera.height
+        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], axis=1)
+        positions[mine] = (rays * depth[mine, None] - camera.translation) @ camera.rotation
+    return Points(positions.astype(np.float32), np.full((count, 3), 128, dtype=np.uint8))
+
+
+def _closest_to_axes(centers: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """[3] the point with the least squared distance to the lines through centers [V, 3] along directions [V, 3]."""
+    across = (
+        np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    )  # projects onto the plane across the axis
+    # lstsq: parallel axes leave the position along them open
+    return np.linalg.lstsq(across.sum(axis=0), (across @ centers[:, :, None]).sum(axis=0)[:, 0], rcond=1e-6)[
+        0
+    ]

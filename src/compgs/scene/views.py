@@ -1,0 +1,47 @@
+"""What was captured: views (image + camera), points, and the scene that holds them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from compgs.cameras import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A photograph and where it was taken from."""
+
+    name: str  # relative to the folder of the images, "/" between its parts
+    camera: Camera
+    image: np.ndarray  # [H, W, 3] uint8, display RGB, undistorted
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Sparse points of the scene, as structure from motion gives them."""
+
+    positions: np.ndarray  # [P, 3] float32, world units
+    colors: np.ndarray  # [P, 3] uint8, display RGB
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Views and points, split into what is trained on and what is held out."""
+
+    name: str
+    train_views: tuple[View, ...]
+    test_views: tuple[View, ...]  # held out
+    points: Points
+    background: tuple[float, float, float]  # display RGB, 0 to 1, behind everything
+    extent: float  # world units: 1.1 x the largest distance of a camera from their mean (3DGS)
+    source: Path  # the folder that was read
+    notes: tuple[str, ...] = ()  # what was decided or replaced on loading, one sentence each
+
+
+def scene_extent(centers: np.ndarray) -> float:  # centers: [V, 3]
+    """1.1 x the largest distance of a camera from their mean centre, in world units (3DGS)."""
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
