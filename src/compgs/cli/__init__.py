@@ -1,0 +1,1 @@
+"""The command line: one file per command. Only this package prints or parses arguments."""

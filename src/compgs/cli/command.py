@@ -1,0 +1,113 @@
+"""What all commands have in common."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from compgs.errors import ConfigError
+
+NO_DEFAULT = ""  # instead of "(default: None)" in the help
+
+
+class UsageError(ConfigError):
+    """The command line cannot be understood as it stands."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """A command: its fields are its arguments, its docstring is its help, `run` does it."""
+
+    debug: FlagCreatePairsOff[bool] = False
+    """Show where in the program an error came from."""
+
+    def run(self) -> None:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComputingCommand(Command):
+    """A command that computes for a while."""
+
+    threads: Annotated[int | None, arg(metavar="N", help_behavior_hint=NO_DEFAULT)] = None
+    """Threads to use; all cores by default. Results do not depend on it, times do."""
+
+    device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint=NO_DEFAULT)] = None
+    """Where to compute; a CUDA GPU by default where there is one."""
+
+    def prepare(self) -> None:
+        """Apply `threads`, check `device`. Raises UsageError, ConfigError."""
+        if self.threads is not None:
+            use_threads(self.threads)
+        if self.device is not None:
+            check_device(self.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileArgument:
+    """Which file."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The .cgs file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Which scene, and how it is read."""
+
+    scene: Annotated[Positional[Path | None], arg(metavar="SCENE", help_behavior_hint=NO_DEFAULT)] = None
+    """Folder of the scene: COLMAP (images/ and sparse/), Blender or nerfstudio (transforms*.json)."""
+
+    source: Annotated[
+        Path | None, arg(aliases=["-s", "--source-path"], metavar="SCENE", help_behavior_hint=NO_DEFAULT)
+    ] = None
+    """The same, spelled as 3DGS does."""
+
+    downscale: Annotated[int, arg(aliases=["-r", "--resolution"], metavar="N")] = 1
+    """Read images N times smaller; images_N is used where it exists."""
+
+    images: Annotated[str, arg(aliases=["-i"], metavar="FOLDER")] = "images"
+    """Folder of the images inside the scene."""
+
+    test_every: Annotated[int, arg(metavar="N")] = 8
+    """Every N-th view, by name, is held out for evaluation."""
+
+
+def one_scene(scene: Path | None, source: Path | None) -> Path:
+    """SCENE or --source, whichever was given. Raises UsageError for none or two."""
+    if scene is not None and source is not None and scene != source:
+        raise UsageError(f"two scenes were given: {scene} and --source {source}; give one")
+    chosen = scene or source
+    if chosen is None:
+        raise UsageError("no scene was given: name its folder; --help shows how")
+    return chosen
+
+
+def use_threads(count: int) -> None:
+    """Of numba and torch. Raises UsageError."""
+    import numba
+    import torch
+
+    limit = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    if not 1 <= count <= limit:
+        raise UsageError(f"--threads {count}: expected 1 to {limit}")
+    numba.set_num_threads(count)
+    torch.set_num_threads(count)
+
+
+def check_device(name: str) -> None:
+    """Raises UsageError for a device that PyTorch does not know or does not find."""
+    import torch
+
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise UsageError(f"--device {name}: expected cpu or cuda") from error
+    if device.type not in ("cpu", "cuda"):
+        raise UsageError(f"--device {name}: expected cpu or cuda")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise ConfigError(
+            f"--device {name}: PyTorch finds {torch.cuda.device_count()} CUDA devices; "
+            "use --device cpu, or install a CUDA build of PyTorch"
+        )

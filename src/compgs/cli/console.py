@@ -1,0 +1,78 @@
+"""What people read: the console, tables, sizes and times."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from compgs.evaluation.results import Results
+
+console = Console(highlight=False, soft_wrap=True)
+errors = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def say(message: str) -> None:
+    """One line for a person, markup taken literally."""
+    console.print(escape(message))
+
+
+def size(count: float) -> str:
+    """Bytes as people write them: `812 B`, `258.1 kB`, `1.24 MB` (powers of 1000)."""
+    if count < 1000:
+        return f"{count:.0f} B"
+    if count < 1e6:
+        return f"{count / 1e3:.1f} kB"
+    return f"{count / 1e6:.2f} MB" if count < 1e9 else f"{count / 1e9:.2f} GB"
+
+
+def duration(seconds: float) -> str:
+    """`5.3 ms`, `1.25 s`, `4 min 05 s`."""
+    if seconds < 1:
+        return f"{seconds * 1e3:.1f} ms"
+    if seconds < 60:
+        return f"{seconds:.2f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def print_components(components: Mapping[str, int], anchors: int, coupled: int) -> None:
+    """Bytes and bits by component of a file."""
+    total = sum(components.values())
+    table = Table(box=None, pad_edge=False)
+    for heading in ("component", "bytes", "share", "bits/anchor", "bits/coupled"):
+        table.add_column(heading, justify="left" if heading == "component" else "right")
+    for name, count in [*components.items(), ("total", total)]:
+        share = f"{100 * count / max(total, 1):.1f} %"
+        per_anchor, per_coupled = 8 * count / max(anchors, 1), 8 * count / max(coupled, 1)
+        style = "bold" if name == "total" else None
+        table.add_row(name, f"{count:,}", share, f"{per_anchor:.2f}", f"{per_coupled:.2f}", style=style)
+    console.print(table)
+
+
+def print_results(results: "Results") -> None:
+    """The short table of an evaluation."""
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column()
+    table.add_column(justify="right", style="bold")
+    table.add_row("PSNR", f"{results.psnr:.2f} dB")
+    table.add_row("SSIM", f"{results.ssim:.4f}")
+    if results.lpips is not None:
+        table.add_row("LPIPS", f"{results.lpips:.4f}")
+    elif results.lpips_note != "not asked for":
+        table.add_row("LPIPS", escape(str(results.lpips_note)))
+    table.add_row("file", f"{results.bytes:,} bytes")
+    table.add_row("anchors", f"{results.anchors:,}")
+    table.add_row("coupled primitives", f"{results.coupled_primitives:,}")
+    table.add_row("bits per anchor", f"{results.bits_per_anchor:.1f}")
+    table.add_row("decoding", duration(results.decode_seconds))
+    table.add_row("rendering a view", duration(results.render_seconds))
+    views = f"{len(results.per_view)} held-out views, {results.width} x {results.height}"
+    say(f"{results.file} on {results.scene}: {views}, {results.device}, {results.threads} threads")
+    console.print(table)
+    console.print()
+    print_components(results.components, results.anchors, results.coupled_primitives)

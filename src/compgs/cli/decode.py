@@ -1,0 +1,75 @@
+"""`compgs decode`: what a file holds, as arrays."""
+
+import io
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument
+from compgs.cli.console import duration, say, size
+from compgs.cli.inputs import check_bitstream
+from compgs.outputs import check_output_folder, write_bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decode(ComputingCommand, FileArgument):
+    """Decode a .cgs file and write what it holds as NumPy arrays.
+
+    latents.npz: positions [N, 3], log_scales [N, 6] and references [N, C] of the anchors; residuals [P, C]
+    and anchor_index [P] of the coupled primitives. geometry.npz: their means, scales [P, 3] and quaternions
+    [P, 4] (w-x-y-z) in world units. Opacity and color depend on the view: `compgs render` shows them.
+
+    Examples
+
+    compgs decode garden.cgs
+
+    compgs decode garden.cgs -o garden
+    """
+
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FOLDER", help_behavior_hint=NO_DEFAULT)] = (
+        None
+    )
+    """Folder for the arrays. Without it the file is only decoded, and checked by that."""
+
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace what is in FOLDER already."""
+
+    def run(self) -> None:
+        check_bitstream(self.file)
+        if self.output is not None:
+            check_output_folder(self.output, overwrite=self.overwrite)
+        self.prepare()
+        from compgs.codec import decode
+
+        start = time.perf_counter()
+        model = decode(self.file, self.device)
+        seconds = time.perf_counter() - start
+        say(
+            f"{self.file}: {size(self.file.stat().st_size)}, {model.anchors:,} anchors, "
+            f"{model.coupled:,} coupled primitives, decoded in {duration(seconds)}"
+        )
+        if self.output is None:
+            return
+        import numpy as np
+
+        p = model.primitives
+        means, scales, quaternions = model.geometry
+        contents = {
+            "latents.npz": {
+                "positions": p.positions,
+                "log_scales": p.log_scales,
+                "references": p.references,
+                "residuals": p.residuals,
+                "anchor_index": p.anchor_index,
+            },
+            "geometry.npz": {"means": means, "scales": scales, "quaternions": quaternions},
+        }
+        for name, tensors in contents.items():
+            buffer = io.BytesIO()
+            arrays: dict[str, Any] = {key: value.cpu().numpy() for key, value in tensors.items()}
+            np.savez(buffer, **arrays)
+            write_bytes(self.output / name, buffer.getvalue())
+            say(f"{self.output / name}: {size(buffer.tell())}")

@@ -1,0 +1,61 @@
+"""`compgs demo-scene`: a scene to try the program on."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from compgs.cli.command import Command, UsageError
+from compgs.cli.console import say
+from compgs.cli.progress import counting
+from compgs.outputs import check_output_folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoScene(Command):
+    """Make a scene to try the program on: ray-traced objects, written as a COLMAP data set.
+
+    Example
+
+    compgs demo-scene scenes/demo
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Folder for the scene."""
+
+    views: Annotated[int, arg(metavar="N")] = 40
+    """Number of views."""
+
+    width: Annotated[int, arg(metavar="PIXELS")] = 320
+    """Of the images."""
+
+    height: Annotated[int, arg(metavar="PIXELS")] = 240
+    """Of the images."""
+
+    seed: Annotated[int, arg(metavar="N")] = 0
+    """Of everything random."""
+
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace what is in FOLDER already."""
+
+    def run(self) -> None:
+        if not (
+            2 <= self.views <= 10_000
+            and min(self.width, self.height) >= 16
+            and max(self.width, self.height) <= 8192
+        ):
+            raise UsageError("--views must be 2 to 10000, --width and --height 16 to 8192")
+        check_output_folder(self.folder, overwrite=self.overwrite)
+        from compgs.scene.generated import generate_scene
+
+        with counting("ray tracing") as progress:
+            generate_scene(
+                self.folder,
+                views=self.views,
+                width=self.width,
+                height=self.height,
+                seed=self.seed,
+                progress=progress,
+            )
+        say(f"{self.folder}: {self.views} views, {self.width} x {self.height}, in COLMAP's layout")

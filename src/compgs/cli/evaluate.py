@@ -1,0 +1,65 @@
+"""`compgs evaluate`: what a file is worth, on the held-out views of a scene."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument, SceneOptions, one_scene
+from compgs.cli.console import print_results, say
+from compgs.cli.inputs import check_bitstream
+from compgs.cli.progress import counting
+from compgs.cli.run_folder import SceneSource
+from compgs.cli.scenes import read_scene
+from compgs.outputs import check_output_folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(ComputingCommand, SceneOptions, FileArgument):
+    """Decode a .cgs file, render the held-out views of a scene from it and compare them with the photographs.
+
+    Give -r, --images and --test-every as in training: the views held out there are the ones to evaluate on.
+
+    Examples
+
+    compgs evaluate garden.cgs scenes/garden
+
+    compgs evaluate garden.cgs scenes/garden -r 4 -o garden-evaluation
+    """
+
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="FOLDER", help_behavior_hint=NO_DEFAULT)] = (
+        None
+    )
+    """Folder for results.json, per_view.json, renders, photographs and contact sheet."""
+
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace an evaluation that is in FOLDER already."""
+
+    lpips: FlagCreatePairsOff[bool] = False
+    """Also measure LPIPS (needs `pip install 'compgs[lpips]'`)."""
+
+    def run(self) -> None:
+        check_bitstream(self.file)
+        if self.output is not None:
+            check_output_folder(self.output, overwrite=self.overwrite)
+        path = one_scene(self.scene, self.source)
+        self.prepare()
+        from compgs.evaluation import evaluate
+
+        scene = read_scene(SceneSource(str(path), self.downscale, self.images, self.test_every, True))
+        with counting("evaluating views") as progress:
+            results = evaluate(
+                self.file,
+                scene,
+                output=self.output,
+                overwrite=self.overwrite,
+                lpips=self.lpips,
+                device=self.device,
+                progress=progress,
+            )
+        say("")
+        print_results(results)
+        if self.output is not None:
+            say("")
+            say(f"renders beside photographs: {self.output / 'contact_sheet.png'}")

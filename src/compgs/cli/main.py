@@ -1,0 +1,103 @@
+"""`compgs`: dispatch to a command; errors become one clear message and an exit code.
+
+Exit codes: 0 done; 1 something is wrong with the input, the settings, the output or the file; 2 the command
+line could not be understood; 130 stopped by the user.
+"""
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+from rich.markup import escape
+from rich.table import Table
+
+from compgs import __version__
+from compgs.cli.command import Command, UsageError
+from compgs.cli.console import console, errors
+from compgs.cli.decode import Decode
+from compgs.cli.demo_scene import DemoScene
+from compgs.cli.encode import Encode
+from compgs.cli.evaluate import Evaluate
+from compgs.cli.info import Info
+from compgs.cli.render import Render
+from compgs.cli.train import Train
+from compgs.errors import CompGSError
+
+COMMANDS: tuple[type[Command], ...] = (Train, Encode, Decode, Render, Evaluate, Info, DemoScene)
+
+EXAMPLE = "compgs demo-scene demo/scene && compgs train demo/scene -o demo/run --preset quick"
+
+
+def print_help() -> None:
+    """What `compgs` and `compgs --help` show."""
+    console.print(f"[bold]compgs[/] {__version__}: compressed Gaussian splatting")
+    console.print("Photographs in, one small file out, the same scene on every machine.\n")
+    console.print(r"usage: compgs COMMAND \[OPTIONS]" + "\n")
+    table = Table(box=None, pad_edge=False, show_header=False)
+    for command in COMMANDS:
+        table.add_row(
+            f"  [bold]{command_name(command)}[/]", escape((command.__doc__ or "").partition("\n")[0])
+        )
+    console.print(table)
+    console.print("\ncompgs COMMAND --help explains a command, compgs --version shows the version.")
+    console.print(f"A first try: {EXAMPLE}")
+
+
+def command_name(command: type[Command]) -> str:
+    """`DemoScene` is `demo-scene`."""
+    return "".join(f"-{c.lower()}" if c.isupper() else c for c in command.__name__).lstrip("-")
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """Raises SystemExit: 2 for a line that is not understood, 0 for a command's --help."""
+    commands = Annotated[
+        Train | Encode | Decode | Render | Evaluate | Info | DemoScene,
+        tyro.conf.configure(tyro.conf.OmitArgPrefixes),
+    ]
+    return tyro.cli(commands, prog="compgs", args=list(arguments))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given in (["--version"], ["-V"]):
+        print(f"compgs {__version__}")
+        return 0
+    if given in ([], ["--help"], ["-h"]):
+        print_help()
+        return 0
+    try:
+        command = parse(given)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return run(command)
+
+
+def run(command: Command) -> int:
+    """The exit code; unexpected exceptions, which are our mistakes, keep their traceback."""
+    try:
+        command.run()
+    except (CompGSError, OSError, MemoryError) as error:
+        if command.debug:
+            raise
+        errors.print(f"[bold red]error:[/] {escape(explain(error))}")
+        return 2 if isinstance(error, UsageError) else 1
+    except KeyboardInterrupt as stop:
+        errors.print(escape(str(stop) or "interrupted"))
+        return 130
+    return 0
+
+
+def explain(error: Exception) -> str:
+    """One message that says what is wrong and where."""
+    if isinstance(error, MemoryError):
+        return "not enough memory; try a smaller scene, or read smaller images with -r"
+    if isinstance(error, OSError):
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}{error.strerror or error}"
+    return str(error)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,70 @@
+"""A run's folder: what `compgs train` leaves there, and `config.json`, which says how it came about."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from compgs import __version__
+from compgs.config import Config, config_from_dict
+from compgs.errors import CheckpointError
+from compgs.outputs import write_json
+
+SETTINGS_NAME = "config.json"
+CHECKPOINT_NAME = "checkpoint.safetensors"
+TRAINING_NAME = "training.json"
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """Which scene a run was trained on, and how it was read: the arguments of `load_scene`."""
+
+    path: str
+    downscale: int
+    images: str
+    test_every: int
+    holdout: bool
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """The content of `config.json`."""
+
+    preset: str
+    scene: SceneSource
+    config: Config
+
+
+def file_name(folder: Path) -> str:
+    """The `.cgs` file of a run is named after its folder."""
+    return f"{folder.absolute().name}.cgs"
+
+
+def save_settings(folder: Path, settings: RunSettings) -> None:
+    """Raises OutputError."""
+    content = {
+        "compgs": __version__,
+        "preset": settings.preset,
+        "scene": asdict(settings.scene),
+        "settings": settings.config.to_dict(),
+    }
+    write_json(folder / SETTINGS_NAME, content)
+
+
+def load_settings(folder: Path) -> RunSettings:
+    """Raises CheckpointError if the folder holds no run, or not one that can be read."""
+    path = folder / SETTINGS_NAME
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return RunSettings(
+            preset=str(content["preset"]),
+            scene=SceneSource(**content["scene"]),
+            config=config_from_dict(content["settings"], str(path)),
+        )
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            f"{path}: not found; {folder} is not a run that `compgs train` began"
+        ) from error
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise CheckpointError(f"{path}: not the settings of a run ({error}); train anew") from error

@@ -1,0 +1,34 @@
+"""A scene for a command, with its progress and its notes shown."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from compgs.cli.console import say
+from compgs.cli.progress import counting
+from compgs.cli.run_folder import SceneSource
+
+if TYPE_CHECKING:
+    from compgs.scene import Scene
+
+
+def read_scene(source: SceneSource) -> "Scene":
+    """Raises SceneError."""
+    from compgs.scene import load_scene
+
+    with counting("reading views") as progress:
+        scene = load_scene(
+            Path(source.path),
+            downscale=source.downscale,
+            images=source.images,
+            test_every=source.test_every,
+            holdout=source.holdout,
+            progress=progress,
+        )
+    first = (scene.train_views or scene.test_views)[0].camera
+    say(
+        f"{scene.name}: {len(scene.train_views)} training views, {len(scene.test_views)} held out, "
+        f"{first.width} x {first.height} pixels, {len(scene.points.positions):,} points"
+    )
+    for note in scene.notes:
+        say(f"note: {note}")
+    return scene

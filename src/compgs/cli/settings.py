@@ -1,0 +1,61 @@
+"""Settings from the command line: `--set section.key=value`, read by the type that the setting has."""
+
+import types
+import typing
+from collections.abc import Iterable
+from typing import Any
+
+from compgs.config import Config, config_from_dict
+from compgs.errors import ConfigError
+
+
+def with_settings(config: Config, assignments: Iterable[str]) -> Config:
+    """The config with `section.key=value` assignments applied, checked. Raises ConfigError."""
+    values = config.to_dict()
+    kinds = typing.get_type_hints(Config)
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        section, dot, key = name.strip().partition(".")
+        if not (equals and dot):
+            raise ConfigError(f"--set {assignment}: expected section.key=value, as in training.steps=5000")
+        if section not in kinds:
+            raise ConfigError(
+                f"--set {assignment}: there is no section {section!r}; there are {', '.join(kinds)}"
+            )
+        hints = typing.get_type_hints(kinds[section])
+        if key not in hints:
+            raise ConfigError(
+                f"--set {assignment}: there is no setting {key!r}; {section} has {', '.join(hints)}"
+            )
+        try:
+            values[section][key] = parse_value(hints[key], text.strip())
+        except ValueError as error:
+            raise ConfigError(f"--set {assignment}: {error}") from error
+    return config_from_dict(values, "--set")
+
+
+def parse_value(kind: Any, text: str) -> Any:
+    """Raises ValueError that says what was expected."""
+    origin, options = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Literal:
+        if text not in options:
+            raise ValueError(f"expected {' or '.join(map(str, options))}, found {text!r}")
+        return text
+    if origin in (types.UnionType, typing.Union):
+        if text.lower() == "none":
+            return None
+        return parse_value(next(option for option in options if option is not types.NoneType), text)
+    if origin is tuple:
+        parts = text.strip("()[] ").split(",")
+        if len(parts) != len(options):
+            raise ValueError(f"expected {len(options)} numbers with a comma between them, found {text!r}")
+        return tuple(parse_value(option, part.strip()) for option, part in zip(options, parts, strict=True))
+    if kind is bool:
+        if text.lower() not in ("true", "false"):
+            raise ValueError(f"expected true or false, found {text!r}")
+        return text.lower() == "true"
+    try:
+        return kind(text)
+    except ValueError as error:
+        expected = {int: "a whole number", float: "a number"}.get(kind, kind.__name__)
+        raise ValueError(f"expected {expected}, found {text!r}") from error

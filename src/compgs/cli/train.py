@@ -1,0 +1,223 @@
+"""`compgs train`: photographs in, one small file out, and proof of what the file is worth."""
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
+
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, UsageError, one_scene
+from compgs.cli.console import duration, print_results, say, size
+from compgs.cli.progress import counting, training
+from compgs.cli.run_folder import (
+    CHECKPOINT_NAME,
+    TRAINING_NAME,
+    RunSettings,
+    SceneSource,
+    file_name,
+    load_settings,
+    save_settings,
+)
+from compgs.cli.scenes import read_scene
+from compgs.cli.settings import with_settings
+from compgs.config import load_config
+from compgs.errors import CheckpointError, ConfigError, OutputError
+from compgs.outputs import check_output_folder, write_json
+
+if TYPE_CHECKING:
+    from compgs.scene import Scene
+    from compgs.trained_model import TrainedModel
+    from compgs.training import TrainingStatus
+
+NEEDED_BYTES = (
+    64 << 20
+)  # checkpoint, file and renders of a small scene; a large one fails later, but loses nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(ComputingCommand, SceneOptions):
+    """Train a scene, write its .cgs file, decode the file and compare it with the held-out views.
+
+    The run's folder then holds the file, results.json, per_view.json, config.json, the renders beside the
+    photographs (test/renders, test/gt, contact_sheet.png) and a checkpoint.
+
+    Examples
+
+    compgs train scenes/garden -o runs/garden
+
+    compgs train scenes/garden -o runs/quick --preset quick -r 4
+
+    compgs train -s scenes/garden -m runs/garden --eval --iterations 30000
+
+    compgs train scenes/garden -o runs/small --lmbda 0.01 --set model.coupled_primitives=5
+
+    compgs train -o runs/garden --resume
+    """
+
+    output: Annotated[
+        Path | None,
+        arg(aliases=["-o", "-m", "--model", "--model-path"], metavar="RUN", help_behavior_hint=NO_DEFAULT),
+    ] = None
+    """Folder for the run. The file is named after it."""
+
+    eval: bool = True
+    """Hold views out and evaluate on them; --no-eval trains on every view."""
+
+    preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: default)")] = None
+    """Settings to start from: default, paper (as published) or quick (minutes on two cores)."""
+
+    lmbda: Annotated[float | None, arg(metavar="LAMBDA", help_behavior_hint="(default: the preset's)")] = None
+    """Weight of the rate: larger means a smaller file."""
+
+    steps: Annotated[
+        int | None, arg(aliases=["--iterations"], metavar="N", help_behavior_hint="(default: the preset's)")
+    ] = None
+    """Training steps, one view each; all schedules scale with it."""
+
+    seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
+    """Of every random choice: the same seed on the same CPU gives the same file."""
+
+    set: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="SECTION.KEY=VALUE")] = ()
+    """Any other setting of the run; sections: model, entropy, control, training."""
+
+    resume: FlagCreatePairsOff[bool] = False
+    """Continue the run in RUN from its last checkpoint, with the settings it began with."""
+
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace a run that is in RUN already."""
+
+    lpips: FlagCreatePairsOff[bool] = False
+    """Also measure LPIPS (needs `pip install 'compgs[lpips]'`)."""
+
+    def run(self) -> None:
+        if self.output is None:
+            raise UsageError(
+                "no folder for the run was given: name it with -o, as in `compgs train SCENE -o RUN`"
+            )
+        if self.resume and self.overwrite:
+            raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
+        folder = self.output
+        check_output_folder(folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES)
+        settings = self.settings(folder)
+        self.prepare()
+        scene = read_scene(settings.scene)
+        if not self.resume:
+            forget_earlier_run(folder)
+            save_settings(folder, settings)
+        model = self.train(scene, settings, folder)
+        self.encode_and_evaluate(scene, model, folder)
+
+    def settings(self, folder: Path) -> RunSettings:
+        """From the command line, or of the run to be continued. Raises ConfigError, CheckpointError."""
+        if not self.resume:
+            preset = self.preset or "default"
+            path = one_scene(self.scene, self.source)
+            source = SceneSource(str(path), self.downscale, self.images, self.test_every, self.eval)
+            return RunSettings(preset, source, with_settings(load_config(preset), self.assignments()))
+        begun = load_settings(folder)
+        if not (folder / CHECKPOINT_NAME).is_file():
+            raise CheckpointError(
+                f"{folder / CHECKPOINT_NAME}: not found; the run wrote no checkpoint, train anew"
+            )
+        if self.scene or self.source:
+            # The data may have moved; whether it is the same scene, the checkpoint knows.
+            begun = replace(begun, scene=replace(begun.scene, path=str(one_scene(self.scene, self.source))))
+        if self.preset not in (None, begun.preset):
+            raise ConfigError(f"--preset {self.preset}: the run to continue began with preset {begun.preset}")
+        changed = with_settings(begun.config, self.assignments())
+        if changed != begun.config:
+            raise ConfigError(
+                "--resume continues with the settings the run began with; other ones need a new run"
+            )
+        return begun
+
+    def assignments(self) -> tuple[str, ...]:
+        """Options that are settings, as `section.key=value`."""
+        named = {"training.lmbda": self.lmbda, "training.steps": self.steps, "training.seed": self.seed}
+        return (*(f"{name}={value}" for name, value in named.items() if value is not None), *self.set)
+
+    def train(self, scene: "Scene", settings: RunSettings, folder: Path) -> "TrainedModel":
+        """Raises KeyboardInterrupt, with what to do next, when the user stops it."""
+        from compgs.training import train
+
+        last: TrainingStatus | None = None
+        start = time.perf_counter()
+        try:
+            with training() as show:
+
+                def on_progress(status: "TrainingStatus") -> None:
+                    nonlocal last
+                    last = status
+                    show(status)
+
+                model = train(
+                    scene,
+                    settings.config,
+                    output=folder,
+                    resume=self.resume,
+                    on_progress=on_progress,
+                    device=self.device,
+                )
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(interrupted(folder)) from None
+        seconds = time.perf_counter() - start
+        if last is not None:
+            write_json(
+                folder / TRAINING_NAME,
+                {
+                    "steps": last.steps,
+                    "anchors": last.anchors,
+                    "estimated_bytes": last.estimated_bytes,
+                    "seconds": seconds,
+                    "seconds_per_step": last.seconds_per_step,
+                    "resumed": self.resume,
+                },
+            )
+        say(f"trained in {duration(seconds)}")
+        return model
+
+    def encode_and_evaluate(self, scene: "Scene", model: "TrainedModel", folder: Path) -> None:
+        from compgs.codec import encode
+
+        start = time.perf_counter()
+        encoded = encode(model, folder / file_name(folder), overwrite=True)
+        say(f"{encoded.path}: {size(encoded.bytes)}, encoded in {duration(time.perf_counter() - start)}")
+        if not scene.test_views:
+            say("no views are held out (--no-eval): the file was not evaluated")
+            return
+        from compgs.evaluation import evaluate
+
+        with counting("evaluating views") as progress:
+            results = evaluate(
+                encoded.path,
+                scene,
+                output=folder,
+                overwrite=True,
+                lpips=self.lpips,
+                device=self.device,
+                progress=progress,
+            )
+        say("")
+        print_results(results)
+        say("")
+        say(f"renders beside photographs: {folder / 'contact_sheet.png'}")
+        say(f"for programs: {folder / 'results.json'}, {folder / 'per_view.json'}")
+
+
+def forget_earlier_run(folder: Path) -> None:
+    """Remove what would be taken for the new run's, were the new run to stop early."""
+    stale = [folder / name for name in (CHECKPOINT_NAME, TRAINING_NAME, "results.json", "per_view.json")]
+    for path in [*stale, folder / file_name(folder)]:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be replaced ({error.strerror})") from error
+
+
+def interrupted(folder: Path) -> str:
+    """What to tell someone who stopped a training."""
+    checkpoint = folder / CHECKPOINT_NAME
+    if not checkpoint.is_file():
+        return "interrupted before the first checkpoint: start again with --overwrite"
+    return f"interrupted; the checkpoint is {checkpoint}\ncontinue with: compgs train -o {folder} --resume"

@@ -1,0 +1,134 @@
+"""Cameras without a data set: read from a JSON file, or on a circle around the scene.
+
+A camera file is a list of objects with `world_to_camera` (4 rows of 4 numbers, rigid; OpenCV axes), `fx`,
+`fy`, `cx`, `cy`, `width`, `height` (pixels) and, for people, `name`. `compgs train` and `compgs evaluate`
+leave one of the held-out views.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compgs.cameras import Camera
+from compgs.errors import SceneError, UnsupportedCamera
+
+MAX_SIDE = 16_384  # pixels
+
+FIELDS = ("world_to_camera", "fx", "fy", "cx", "cy", "width", "height")
+
+
+def camera_entry(camera: Camera, name: str) -> dict[str, Any]:
+    """One entry of a camera file."""
+    return {
+        "name": name,
+        "world_to_camera": np.asarray(camera.world_to_camera, dtype=np.float64).tolist(),
+        "fx": float(camera.fx),
+        "fy": float(camera.fy),
+        "cx": float(camera.cx),
+        "cy": float(camera.cy),
+        "width": int(camera.width),
+        "height": int(camera.height),
+    }
+
+
+def camera_from_entry(entry: Any, place: str) -> tuple[str, Camera]:
+    """Inverse of `camera_entry`. Raises UnsupportedCamera with `place` in front."""
+    if not isinstance(entry, dict):
+        raise UnsupportedCamera(
+            f"{place}: expected an object with {', '.join(FIELDS)}, found {type(entry).__name__}"
+        )
+    missing = [field for field in FIELDS if field not in entry]
+    if missing:
+        raise UnsupportedCamera(f"{place}: {missing[0]!r} is missing; a camera has {', '.join(FIELDS)}")
+    try:
+        pose = np.array(entry["world_to_camera"], dtype=np.float64)
+        fx, fy, cx, cy = (float(entry[field]) for field in ("fx", "fy", "cx", "cy"))
+        width, height = int(entry["width"]), int(entry["height"])
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UnsupportedCamera(f"{place}: not a number where one is expected ({error})") from error
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise UnsupportedCamera(f"{place}: world_to_camera must be 4 rows of 4 finite numbers")
+    rotation = pose[:3, :3]
+    if not (
+        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+        and np.linalg.det(rotation) > 0
+        and np.allclose(pose[3], [0, 0, 0, 1])
+    ):
+        raise UnsupportedCamera(f"{place}: world_to_camera is not a rotation and a translation")
+    if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
+        raise UnsupportedCamera(
+            f"{place}: focal lengths must be positive, centres finite; found {fx, fy, cx, cy}"
+        )
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise UnsupportedCamera(
+            f"{place}: image size {width} x {height}; expected 1 to {MAX_SIDE} pixels a side"
+        )
+    return str(entry.get("name", place)), Camera(pose, fx, fy, cx, cy, width, height)
+
+
+def read_cameras(path: Path) -> list[tuple[str, Camera]]:
+    """Names and cameras of a camera file. Raises SceneError."""
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise SceneError(f"{path}: not a camera file: {error}") from error
+    if not isinstance(entries, list) or not entries:
+        raise SceneError(
+            f"{path}: expected a list of cameras, found {type(entries).__name__ if entries else 'none'}"
+        )
+    return [camera_from_entry(entry, f"{path}: camera {i}") for i, entry in enumerate(entries)]
+
+
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """[4, 4] world to camera of a camera at `eye` that has `target` in its middle and `up` upwards."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, down, forward])
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose
+
+
+def orbit(
+    positions: np.ndarray,  # [N, 3] world units, of the scene
+    *,
+    frames: int,
+    width: int,
+    height: int,
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0),
+    elevation: float = 25.0,  # degrees above the horizon
+    distance: float = 2.2,  # in radii of the scene
+    field_of_view: float = 50.0,  # degrees, of the image's longer side
+) -> list[tuple[str, Camera]]:
+    """Cameras on a circle around the middle of a scene, looking at it.
+
+    The middle is the median position, the radius what three quarters of the positions lie in: the far
+    background of a capture does not count. Captures do not say where up is; -y is what COLMAP's usually comes
+    out as.
+    """
+    axis = np.asarray(up, dtype=np.float64)
+    length = np.linalg.norm(axis)
+    if not (np.isfinite(axis).all() and length > 0):
+        raise UnsupportedCamera(f"up: expected a direction, found {up}")
+    axis /= length
+    middle = np.median(positions, axis=0).astype(np.float64)
+    radius = max(float(np.quantile(np.linalg.norm(positions - middle, axis=1), 0.75)), 1e-6)
+    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    side /= np.linalg.norm(side)
+    front = np.cross(axis, side)
+    tilt = np.deg2rad(elevation)
+    focal = max(width, height) / (2 * np.tan(np.deg2rad(field_of_view) / 2))
+    result = []
+    for i in range(frames):
+        angle = 2 * np.pi * i / frames
+        around = np.cos(angle) * front + np.sin(angle) * side
+        eye = middle + distance * radius * (np.cos(tilt) * around + np.sin(tilt) * axis)
+        pose = look_at(eye, middle, axis)
+        result.append((f"orbit {i}", Camera(pose, focal, focal, width / 2, height / 2, width, height)))
+    return result

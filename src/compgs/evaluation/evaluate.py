@@ -1,0 +1,168 @@
+"""Rate and distortion of a file, measured on what is decoded from it, never on a trained model."""
+
+import hashlib
+import io
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+import numpy as np
+import torch
+from PIL import Image
+
+from compgs import __version__, metrics
+from compgs.cameras import Camera
+from compgs.codec.decoder import decode
+from compgs.codec.reader import file_info
+from compgs.errors import SceneError
+from compgs.evaluation.camera_path import camera_entry
+from compgs.evaluation.contact_sheet import contact_sheet
+from compgs.evaluation.results import Results, ViewResult
+from compgs.model.hybrid_model import HybridModel
+from compgs.outputs import check_output_folder, write_bytes, write_json
+from compgs.render import render
+from compgs.scene.views import Scene, View
+
+SHEET_ROWS = 4  # views on the contact sheet
+
+
+def evaluate(
+    file: str | Path,
+    scene: Scene,
+    *,
+    output: str | Path | None = None,
+    overwrite: bool = False,
+    lpips: bool = False,
+    device: str | torch.device | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Results:
+    """Decode a .cgs file and compare its renderings with the held-out views of a scene.
+
+    Metrics are of 8-bit images (`compgs.metrics`). With `output`, a folder, `results.json` and
+    `per_view.json` (their schema: `compgs.evaluation.results`), `cameras.json` (of the held-out views),
+    `test/renders`, `test/gt` and `contact_sheet.png` are written there. `progress(done, total)` is called
+    after each view.
+
+    Raises BitstreamError, SceneError if the scene holds no view out, OutputError.
+    """
+    path = Path(file)
+    if output is not None:
+        check_output_folder(Path(output), overwrite=overwrite)
+    if not scene.test_views:
+        raise SceneError(
+            f"{scene.name}: no view is held out, so there is nothing to evaluate on; load with hold-out"
+        )
+    chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    model, first_seconds = _timed_decode(path, chosen)
+    model, decode_seconds = _timed_decode(path, chosen)
+
+    timed_render(
+        model, scene.test_views[0].camera
+    )  # kernels are loaded and caches filled: not what a view costs
+    lpips_note: str | None = None if lpips else "not asked for"
+    rows: list[ViewResult] = []
+    images: list[np.ndarray] = []
+    for i, view in enumerate(scene.test_views):
+        image, seconds = timed_render(model, view.camera)
+        distance: float | None = None
+        if lpips_note is None:
+            try:
+                distance = metrics.lpips(image, view.image)
+            except metrics.Unavailable as reason:
+                lpips_note = f"unavailable: {reason}"
+        rows.append(
+            ViewResult(
+                name=view.name,
+                file=f"{i:05d}.png",
+                psnr=metrics.psnr(image, view.image),
+                ssim=metrics.ssim(image, view.image),
+                lpips=distance,
+                render_seconds=seconds,
+            )
+        )
+        images.append(image)
+        if progress:
+            progress(i + 1, len(scene.test_views))
+
+    data = path.read_bytes()
+    results = Results(
+        compgs=__version__,
+        scene=scene.name,
+        file=path.name,
+        width=scene.test_views[0].camera.width,
+        height=scene.test_views[0].camera.height,
+        bytes=len(data),
+        components=component_bytes(data),
+        anchors=model.anchors,
+        coupled_primitives=model.coupled,
+        first_decode_seconds=first_seconds,
+        decode_seconds=decode_seconds,
+        device=device_name(chosen),
+        threads=numba.get_num_threads(),
+        sha256=hashlib.sha256(data).hexdigest(),
+        lpips_note=lpips_note,
+        per_view=tuple(rows),
+    )
+    if output is not None:
+        write_evaluation(Path(output), results, scene.test_views, images)
+    return results
+
+
+def timed_render(model: HybridModel, camera: Camera) -> tuple[np.ndarray, float]:
+    """[H, W, 3] uint8, and the seconds it took until the image was there."""
+    start = time.perf_counter()
+    image = to_uint8(render(model, camera).image)
+    return image, time.perf_counter() - start
+
+
+def to_uint8(image: torch.Tensor) -> np.ndarray:
+    """[H, W, 3] floats, 0 to 1, rounded to the nearest of 256 levels."""
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def component_bytes(data: bytes) -> dict[str, int]:
+    """Bytes of each component of a file; they sum to its size."""
+    return {section.name: section.bytes for section in file_info(data).sections}
+
+
+def device_name(device: torch.device) -> str:
+    """`cpu`, or the name of the GPU."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+
+
+def write_evaluation(
+    folder: Path, results: Results, views: tuple[View, ...], images: list[np.ndarray]
+) -> None:
+    """The files of an evaluation; images of an earlier one with more views are removed."""
+    renders, photographs = folder / "test" / "renders", folder / "test" / "gt"
+    for row, view, image in zip(results.per_view, views, images, strict=True):
+        write_bytes(renders / row.file, encode_png(image))
+        write_bytes(photographs / row.file, encode_png(view.image))
+    names = {row.file for row in results.per_view}
+    for place in (renders, photographs):
+        for old in place.glob("[0-9][0-9][0-9][0-9][0-9].png"):
+            if old.name not in names:
+                old.unlink(missing_ok=True)
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(SHEET_ROWS, len(views))).round().astype(int))
+    sheet = contact_sheet(
+        [(views[i].image, images[i], views[i].name, results.per_view[i].psnr) for i in chosen],
+        f"{results.scene}: {results.bytes / 1000:.1f} kB, {results.psnr:.2f} dB, {len(views)} held-out views",
+    )
+    write_bytes(folder / "contact_sheet.png", encode_png(sheet))
+    write_json(folder / "cameras.json", [camera_entry(view.camera, view.name) for view in views])
+    write_json(folder / "per_view.json", results.per_view_list())
+    write_json(folder / "results.json", results.to_dict())
+
+
+def encode_png(image: np.ndarray) -> bytes:
+    """Of a [H, W, 3] uint8 image."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def _timed_decode(path: Path, device: torch.device) -> tuple[HybridModel, float]:
+    start = time.perf_counter()
+    model = decode(path, device)
+    return model, time.perf_counter() - start

@@ -1,0 +1,124 @@
+"""What an evaluation found, and how it is written down.
+
+`results.json` (one object; every number from the decoded file, on held-out views):
+
+| key | unit, meaning |
+|---|---|
+| schema | "compgs results 1" |
+| compgs | version of the program that evaluated |
+| scene, file | names |
+| views, width, height | number of held-out views; pixels of the first |
+| psnr | dB, mean over the views |
+| ssim | mean over the views |
+| lpips | mean over the views, or null; `lpips_note` then says why |
+| bytes | of the whole file |
+| components | bytes by component of the file; they sum to `bytes` |
+| anchors, coupled_primitives | counts |
+| bits_per_anchor, bits_per_coupled_primitive | all bits of the file by each count |
+| first_decode_seconds, decode_seconds | file to model: first in a process (loads kernels); again |
+| render_seconds | median over the views, after one view to warm up |
+| device, threads | where it ran |
+| sha256 | of the file |
+
+`per_view.json`: a list in the views' order with `name`, `file` (of `test/renders` and `test/gt`), `psnr`,
+`ssim`, `lpips`, `render_seconds`.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from statistics import fmean, median
+from typing import Any
+
+SCHEMA = "compgs results 1"
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """One held-out view."""
+
+    name: str  # of the view, as the scene has it
+    file: str  # of the image in test/renders and test/gt
+    psnr: float  # dB
+    ssim: float
+    lpips: float | None
+    render_seconds: float
+
+
+@dataclass(frozen=True)
+class Results:
+    """A decoded file against the held-out views of a scene."""
+
+    compgs: str
+    scene: str
+    file: str
+    width: int  # pixels
+    height: int  # pixels
+    bytes: int
+    components: dict[str, int]  # bytes
+    anchors: int
+    coupled_primitives: int
+    first_decode_seconds: float
+    decode_seconds: float
+    device: str
+    threads: int
+    sha256: str
+    lpips_note: str | None  # why there is no LPIPS
+    per_view: tuple[ViewResult, ...]
+
+    @property
+    def psnr(self) -> float:
+        """dB, mean over the views."""
+        return fmean(view.psnr for view in self.per_view)
+
+    @property
+    def ssim(self) -> float:
+        return fmean(view.ssim for view in self.per_view)
+
+    @property
+    def lpips(self) -> float | None:
+        values = [view.lpips for view in self.per_view if view.lpips is not None]
+        return fmean(values) if len(values) == len(self.per_view) else None
+
+    @property
+    def render_seconds(self) -> float:
+        return median(view.render_seconds for view in self.per_view)
+
+    @property
+    def bits_per_anchor(self) -> float:
+        return 8 * self.bytes / self.anchors
+
+    @property
+    def bits_per_coupled_primitive(self) -> float:
+        return 8 * self.bytes / self.coupled_primitives
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of `results.json`."""
+        return {
+            "schema": SCHEMA,
+            "compgs": self.compgs,
+            "scene": self.scene,
+            "file": self.file,
+            "views": len(self.per_view),
+            "width": self.width,
+            "height": self.height,
+            "psnr": self.psnr,
+            "ssim": self.ssim,
+            "lpips": self.lpips,
+            "lpips_note": self.lpips_note,
+            "bytes": self.bytes,
+            "components": self.components,
+            "anchors": self.anchors,
+            "coupled_primitives": self.coupled_primitives,
+            "bits_per_anchor": self.bits_per_anchor,
+            "bits_per_coupled_primitive": self.bits_per_coupled_primitive,
+            "first_decode_seconds": self.first_decode_seconds,
+            "decode_seconds": self.decode_seconds,
+            "render_seconds": self.render_seconds,
+            "device": self.device,
+            "threads": self.threads,
+            "sha256": self.sha256,
+        }
+
+    def per_view_list(self) -> list[dict[str, Any]]:
+        """The content of `per_view.json`."""
+        return [dataclasses.asdict(view) for view in self.per_view]

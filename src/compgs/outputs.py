@@ -1,0 +1,84 @@
+"""Places to write to: checked before any work is done; a written file is whole or not there."""
+
+import contextlib
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from compgs.errors import OutputError
+
+
+def check_output_file(path: Path, *, overwrite: bool = False, needed_bytes: int = 1 << 20) -> None:
+    """Raises OutputError if `path` exists (unless `overwrite`) or could not be written."""
+    if path.is_dir():
+        raise OutputError(f"{path}: expected a file to write, found a folder; name a file inside it")
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists already; choose another name or give --overwrite")
+    _check_place(path.parent, needed_bytes)
+
+
+def check_output_folder(folder: Path, *, overwrite: bool = False, needed_bytes: int = 16 << 20) -> None:
+    """Raises OutputError if `folder` holds something (unless `overwrite`) or could not be written to."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: expected a folder to write to, found a file; choose another name")
+    if folder.is_dir() and not overwrite and _holds_something(folder):
+        raise OutputError(
+            f"{folder}: exists already and is not empty; choose another folder or give --overwrite"
+        )
+    _check_place(folder, needed_bytes)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all; folders on the way are made. Raises OutputError."""
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(data)
+        os.replace(temporary, path)
+    except OSError as error:
+        _remove(temporary)
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def write_json(path: Path, content: dict[str, Any] | list[Any]) -> None:
+    """JSON for programs, indented for people."""
+    write_bytes(path, (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode())
+
+
+def _holds_something(folder: Path) -> bool:
+    try:
+        return any(folder.iterdir())
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be read ({error.strerror})") from error
+
+
+def _check_place(folder: Path, needed_bytes: int) -> None:
+    """`folder` need not exist: what counts is the nearest folder that does. Nothing is left behind."""
+    nearest = folder.absolute()
+    while not nearest.exists():
+        nearest = nearest.parent
+    if not nearest.is_dir():
+        raise OutputError(f"{folder}: {nearest} is a file, not a folder; choose another place")
+    try:
+        # Permissions, read-only file systems and quotas show when something is written, not before.
+        with tempfile.TemporaryFile(dir=nearest) as probe:
+            probe.write(bytes(4096))
+            probe.flush()
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: {nearest} cannot be written to ({error.strerror}); choose another place"
+        ) from error
+    free = shutil.disk_usage(nearest).free
+    if free < needed_bytes:
+        raise OutputError(
+            f"{folder}: the disk is full: at least {needed_bytes / 1e6:.0f} MB are needed, "
+            f"{free / 1e6:.1f} MB are free; make room or choose another place"
+        )
+
+
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        path.unlink(missing_ok=True)
