@@ -1,0 +1,47 @@
+# make demo   a scene is made, trained, encoded, and its file decoded and judged in a new process: about five minutes
+# make test   the test suite
+# make lint   style and types
+# Needs python3 (3.11 or later) and make; everything else is installed into .venv in this folder.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+# Kernels that were compiled once are found again by later processes.
+export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
+# Idle OpenMP threads sleep instead of taking the cores from numba's.
+export OMP_WAIT_POLICY ?= PASSIVE
+
+.PHONY: help demo test lint venv
+
+help:
+	@sed -n 's/^# make/make/p' Makefile
+
+venv: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "Python 3.11 or later is needed, $$($(PYTHON) --version) was found; give another: make PYTHON=..."; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) \
+		|| { echo "python3 -m venv failed; on Debian and Ubuntu it is in the package python3-venv"; exit 1; }
+	@echo "installing CompGS and what it needs into $(VENV) (a few minutes the first time)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+demo: venv
+	@echo "== a scene: ray-traced objects, written as a capture would be"
+	@$(BIN)/compgs demo-scene demo/scene --overwrite
+	@echo "== training and encoding"
+	@$(BIN)/compgs train demo/scene -o demo/run --preset quick --overwrite
+	@$(BIN)/compgs encode demo/run -o demo.cgs --overwrite >/dev/null
+	@echo "== demo.cgs, decoded in a new process and rendered from the held-out views"
+	@$(BIN)/compgs evaluate demo.cgs demo/scene -o demo/evaluation --overwrite
+
+test: venv
+	@$(BIN)/python -m pytest --durations=5
+
+lint: venv
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/mypy
