@@ -1,0 +1,127 @@
+"""The residual MLP of the prediction networks (CompGS Sec. 3.2).
+
+    [f, g] ─► linear ─► leaky ReLU ─► blocks x (x + linear ─ leaky ReLU ─ linear) ─► linear ─► + ─► out
+       └──────────────────────────────── linear (skip) ────────────────────────────────────────┘
+
+`f` are the features of an anchor, `g` the residual embedding of one of its coupled primitives. What the first
+layer and the skip make of `f` is computed once per anchor. All weights are [in, out]; rows of `f` come before
+those of `g`.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from compgs.model import residual_mlp
+from compgs.model.residual_mlp import NEGATIVE_SLOPE
+
+
+def _linear(inputs: int, outputs: int) -> tuple[nn.Parameter, nn.Parameter]:
+    """Weight [inputs, outputs] and bias [outputs], uniform in +-1/sqrt(inputs)."""
+    bound = 1.0 / math.sqrt(inputs)
+    weight = nn.Parameter(torch.empty(inputs, outputs).uniform_(-bound, bound))
+    return weight, nn.Parameter(torch.empty(outputs).uniform_(-bound, bound))
+
+
+class ResidualBlock(nn.Module):
+    """x + linear(leaky(linear(x))), `width` channels."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight1, self.bias1 = _linear(width, width)
+        self.weight2, self.bias2 = _linear(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        hidden = nn.functional.leaky_relu(torch.addmm(self.bias1, x, self.weight1), NEGATIVE_SLOPE)
+        return x + torch.addmm(self.bias2, hidden, self.weight2)
+
+
+class ResidualMLP(nn.Module):
+    """Anchor features and residual embeddings in, one row of outputs per coupled primitive out.
+
+    The bias of the last layer is `output_bias`; the skip has none of its own.
+    """
+
+    def __init__(
+        self, anchor_dim: int, residual_dim: int, outputs: int, width: int = 32, blocks: int = 1
+    ) -> None:
+        super().__init__()
+        self.anchor_dim = anchor_dim
+        self.width = width
+        self.input_weight, self.input_bias = _linear(anchor_dim + residual_dim, width)
+        self.blocks = nn.ModuleList(ResidualBlock(width) for _ in range(blocks))
+        self.output_weight, self.output_bias = _linear(width, outputs)
+        self.skip_weight, _ = _linear(anchor_dim + residual_dim, outputs)
+
+    def forward(
+        self,
+        anchor_features: Tensor,  # [A, anchor_dim]
+        residuals: Tensor,  # [M, residual_dim]
+        anchor_index: Tensor,  # [M] int64, ascending: row of anchor_features of each coupled primitive
+    ) -> Tensor:  # [M, outputs]
+        # First layer and skip side by side: [inputs, width + outputs].
+        entry = torch.cat([self.input_weight, self.skip_weight], 1)
+        bias = torch.cat([self.input_bias, self.output_bias])
+        shared = torch.addmm(bias, anchor_features, entry[: self.anchor_dim])
+        entry = entry[self.anchor_dim :]
+        if residuals.device.type == "cpu" and residuals.dtype == torch.float32:
+            weights = [entry, *(p for block in self.blocks for p in block.parameters()), self.output_weight]
+            return _FusedMLP.apply(shared, residuals, anchor_index, *weights)
+        first = torch.addmm(shared.index_select(0, anchor_index), residuals, entry)
+        x = nn.functional.leaky_relu(first[:, : self.width], NEGATIVE_SLOPE)
+        for block in self.blocks:
+            x = block(x)
+        return torch.addmm(first[:, self.width :], x, self.output_weight)
+
+
+_A = np.ndarray
+
+
+def _arrays(weights: tuple[Tensor, ...]) -> tuple[_A, _A, _A, _A, _A, _A]:
+    """R, V1, a1, V2, a2, U of `residual_mlp` from the list of weights of `_FusedMLP`."""
+    values = [w.detach().contiguous().numpy() for w in weights]
+    width = len(values[-1])
+    blocks = (len(values) - 2) // 4
+    shapes = (width, width), (width,), (width, width), (width,)
+    stacked = [
+        np.stack(values[1 + k : -1 : 4]) if blocks else np.zeros((0, *shape), np.float32)
+        for k, shape in enumerate(shapes)
+    ]
+    V1, a1, V2, a2 = stacked
+    return values[0], V1, a1, V2, a2, values[-1]
+
+
+class _FusedMLP(torch.autograd.Function):
+    """Everything after the anchor's part, on the CPU in float32. Weights: entry, four per block, output."""
+
+    @staticmethod
+    def forward(ctx: Any, shared: Tensor, residuals: Tensor, index: Tensor, *weights: Tensor) -> Tensor:
+        shared, residuals, index = shared.contiguous(), residuals.contiguous(), index.contiguous()
+        out = residuals.new_empty(len(residuals), weights[-1].shape[1])
+        inputs = residuals.detach().numpy(), index.numpy(), shared.detach().numpy()
+        residual_mlp.forward(*inputs, *_arrays(weights), out.numpy())
+        ctx.save_for_backward(shared, residuals, index, *weights)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        shared, residuals, index, *weights = ctx.saved_tensors
+        want_shared, want_residuals, _, *want_weights = ctx.needs_input_grad
+        # Empty means not wanted.
+        d_shared = shared.new_zeros(len(shared) if want_shared else 0, shared.shape[1])
+        d_residuals = residuals.new_empty(len(residuals) if want_residuals else 0, residuals.shape[1])
+        size = sum(w.numel() for w in weights) if any(want_weights) else 0
+        parts = np.zeros((residual_mlp.CHUNKS, size), np.float32)
+        inputs = residuals.detach().numpy(), index.numpy(), shared.detach().numpy()
+        bounds = residual_mlp.chunk_bounds(inputs[1], residual_mlp.CHUNKS)
+        outputs = d_residuals.numpy(), d_shared.numpy(), parts
+        d_out = grads[0].contiguous().numpy()
+        residual_mlp.backward(*inputs, *_arrays(tuple(weights)), d_out, bounds, *outputs)
+        d_weights: list[Tensor | None] = [None] * len(weights)
+        if size:
+            pieces = torch.from_numpy(parts.sum(0)).split([w.numel() for w in weights])
+            d_weights = [g.view(w.shape) for g, w in zip(pieces, weights, strict=True)]
+        return d_shared if want_shared else None, d_residuals if want_residuals else None, None, *d_weights
