@@ -1,0 +1,262 @@
+"""Network weights: arrays of integers of 6 to 16 bits (docs/bitstream.md, "Arrays of integers").
+
+Weights of a layer are roughly Gaussian, so they go through the Gaussian tables of the latents; what is wider
+than the widest table leaves some low bits uncoded. Table and number of low bits are chosen for each array by
+counting bits.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from compgs.codec.fields import FieldReader, signed_varint, varint
+from compgs.codec.integer_network import MAX_SHIFT, IntegerLayer, IntegerNetwork
+from compgs.codec.rans import decode_symbols, encode_symbols
+from compgs.codec.tables import GAUSSIAN_COUNT, SCALES_PER_OCTAVE, SMALLEST_SCALE_OCTAVE, gaussian_tables
+from compgs.errors import CorruptSection, NotEncodable
+
+NETWORKS = ("reference", "covariance", "residual")  # in the file's order
+MAX_LAYERS = 8
+MAX_LAYER_WIDTH = 1 << 16
+MAX_TENSORS = 256
+MAX_NAME_BYTES = 64
+MAX_RANK = 4
+MAX_EXPONENT = 62  # absolute value
+MAX_WEIGHTS = 1 << 22  # in a section
+MAX_LOW_BITS = 26
+
+
+@dataclass(frozen=True)
+class QuantizedTensor:
+    """A network parameter as the file holds it: value = values * 2^-exponent."""
+
+    values: np.ndarray  # int32, any shape
+    exponent: int
+
+
+def encode_arrays(arrays: Sequence[np.ndarray]) -> bytes:
+    """Integer arrays of 32 signed bits; the decoder must know their shapes."""
+    settings, highs, index, lows = [], [], [], []
+    for array in arrays:
+        values = array.ravel().astype(np.int64)
+        table, low_bits = _cheapest(values)
+        settings.append(bytes([table, low_bits]))
+        high, low = _split(values, low_bits)
+        highs.append(high.astype(np.int32))
+        index.append(np.full(len(values), table, np.uint8))
+        lows.append(((low[:, None] >> np.arange(low_bits - 1, -1, -1)) & 1).astype(np.uint8).ravel())
+    stream = encode_symbols(np.concatenate(highs), np.concatenate(index), gaussian_tables())
+    return b"".join([*settings, varint(len(stream)), stream, np.packbits(np.concatenate(lows)).tobytes()])
+
+
+def decode_arrays(reader: FieldReader, shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:  # int32
+    """Inverse of `encode_arrays`; reads the section to its end."""
+    sizes = [int(np.prod(shape)) for shape in shapes]
+    settings = []
+    for i in range(len(shapes)):
+        table = reader.varint(f"table of array {i}", 0, GAUSSIAN_COUNT - 1)
+        settings.append((table, reader.varint(f"low bits of array {i}", 0, MAX_LOW_BITS)))
+    stream = reader.bytes(reader.varint("bytes of weights", 0, reader.remaining), "weights")
+    low_count = sum(size * bits for size, (_, bits) in zip(sizes, settings, strict=True))
+    packed = np.frombuffer(reader.bytes(-(-low_count // 8), "low bits"), np.uint8)
+    reader.end()
+    bits = np.unpackbits(packed)
+    if bits[low_count:].any():
+        raise CorruptSection(f"{reader.section}: the bits after the last low bit are not zero")
+    index = np.repeat(np.array([table for table, _ in settings], np.uint8), sizes)
+    highs = decode_symbols(stream, index, gaussian_tables(), reader.section)
+    arrays = []
+    at = bit_at = 0
+    for shape, size, (_, low_bits) in zip(shapes, sizes, settings, strict=True):
+        low = bits[bit_at : bit_at + size * low_bits].reshape(size, low_bits).astype(np.int64)
+        values = _join(
+            highs[at : at + size], low @ (1 << np.arange(low_bits - 1, -1, -1, dtype=np.int64)), low_bits
+        )
+        if size and (values.min() < -(1 << 31) or values.max() >= 1 << 31):
+            raise CorruptSection(f"{reader.section}: a weight does not fit into 32 bits")
+        arrays.append(values.astype(np.int32).reshape(shape))
+        at += size
+        bit_at += size * low_bits
+    return arrays
+
+
+def encode_networks(networks: dict[str, IntegerNetwork]) -> bytes:
+    """The entropy networks' section. Arrays in two halves: means and scales, in the last layer, differ in
+    spread.
+    """
+    fields, arrays = [], []
+    for name in NETWORKS:
+        layers = networks[name].layers
+        if len(layers) > MAX_LAYERS:
+            raise NotEncodable(f"{name} network: {len(layers)} layers, the format holds at most {MAX_LAYERS}")
+        fields.append(varint(len(layers)))
+        for layer in layers:
+            if max(layer.weight.shape) > MAX_LAYER_WIDTH:
+                raise NotEncodable(f"{name} network: a layer is wider than {MAX_LAYER_WIDTH}")
+            fields.append(varint(len(layer.bias)) + bytes([layer.shift | layer.rectify << 7]))
+            arrays += np.array_split(layer.weight, 2) + np.array_split(layer.bias, 2)
+    _check_count("entropy networks", arrays)
+    return b"".join(fields) + encode_arrays(arrays)
+
+
+def decode_networks(
+    data: bytes, section: str, sizes: dict[str, tuple[int, int]]
+) -> dict[str, IntegerNetwork]:
+    """Inverse of `encode_networks`, given (inputs, outputs) of each network."""
+    reader = FieldReader(data, section)
+    plan: list[tuple[str, int, bool]] = []
+    shapes: list[tuple[int, ...]] = []
+    for name in NETWORKS:
+        width, outputs = sizes[name]
+        for i in range(reader.varint(f"layers of the {name} network", 1, MAX_LAYERS)):
+            out = reader.varint(f"width of {name} layer {i}", 1, MAX_LAYER_WIDTH)
+            flags = reader.bytes(1, f"shift of {name} layer {i}")[0]
+            if flags & 0x7F > MAX_SHIFT:
+                raise CorruptSection(
+                    f"{section}: shift of {name} layer {i} is {flags & 0x7F}, expected 0 to {MAX_SHIFT}"
+                )
+            plan.append((name, flags & 0x7F, bool(flags >> 7)))
+            halves = (out - out // 2, out // 2)
+            shapes += [(halves[0], width), (halves[1], width), (halves[0],), (halves[1],)]
+            width = out
+        if width != outputs:
+            raise CorruptSection(f"{section}: the {name} network has {width} outputs, expected {outputs}")
+    _check_sizes(section, shapes)
+    arrays = decode_arrays(reader, shapes)
+    layers: dict[str, list[IntegerLayer]] = {name: [] for name in NETWORKS}
+    for i, (name, shift, rectify) in enumerate(plan):
+        weight = np.concatenate(arrays[4 * i : 4 * i + 2])
+        bias = np.concatenate(arrays[4 * i + 2 : 4 * i + 4]).astype(np.int64)
+        layers[name].append(IntegerLayer(weight, bias, shift, rectify))
+    try:
+        return {name: IntegerNetwork(tuple(layers[name])) for name in NETWORKS}
+    except ValueError as error:
+        raise CorruptSection(f"{section}: {error}") from error
+
+
+def encode_heads(heads: Sequence[tuple[str, QuantizedTensor]]) -> bytes:
+    """The prediction networks' section: named tensors, a name spelled from where it differs from the one
+    before.
+    """
+    if len(heads) > MAX_TENSORS:
+        raise NotEncodable(f"prediction heads: {len(heads)} tensors, the format holds at most {MAX_TENSORS}")
+    fields = [varint(len(heads))]
+    previous = b""
+    for text, tensor in heads:
+        name = text.encode()
+        if not 0 < len(name) <= MAX_NAME_BYTES:
+            raise NotEncodable(
+                f"prediction heads: name {text!r} has {len(name)} bytes, expected 1 to {MAX_NAME_BYTES}"
+            )
+        if tensor.values.ndim > MAX_RANK or abs(tensor.exponent) > MAX_EXPONENT:
+            raise NotEncodable(
+                f"prediction heads: {text} has rank {tensor.values.ndim}, exponent {tensor.exponent}"
+            )
+        if max(tensor.values.shape, default=1) > MAX_LAYER_WIDTH:
+            raise NotEncodable(f"prediction heads: {text} has shape {tensor.values.shape}")
+        shared = _shared_prefix(previous, name)
+        fields.append(varint(shared) + varint(len(name) - shared) + name[shared:])
+        fields.append(varint(tensor.values.ndim) + b"".join(varint(n) for n in tensor.values.shape))
+        fields.append(signed_varint(tensor.exponent))
+        previous = name
+    if len({name for name, _ in heads}) < len(heads):
+        raise NotEncodable("prediction heads: two tensors have the same name")
+    arrays = [tensor.values for _, tensor in heads]
+    _check_count("prediction heads", arrays)
+    return b"".join(fields) + (encode_arrays(arrays) if arrays else b"")
+
+
+def decode_heads(data: bytes, section: str) -> tuple[tuple[str, QuantizedTensor], ...]:
+    """Inverse of `encode_heads`."""
+    reader = FieldReader(data, section)
+    names: list[str] = []
+    shapes: list[tuple[int, ...]] = []
+    exponents = []
+    previous = b""
+    for i in range(reader.varint("tensors", 0, MAX_TENSORS)):
+        shared = reader.varint(f"shared name of tensor {i}", 0, len(previous))
+        rest = reader.varint(f"name of tensor {i}", 0, MAX_NAME_BYTES - shared)
+        name = previous[:shared] + reader.bytes(rest, f"name of tensor {i}")
+        if not name or _shared_prefix(previous, name) != shared:
+            raise CorruptSection(f"{section}: the name of tensor {i} is not spelled as an encoder spells it")
+        rank = reader.varint(f"rank of tensor {i}", 0, MAX_RANK)
+        shapes.append(tuple(reader.varint(f"shape of tensor {i}", 0, MAX_LAYER_WIDTH) for _ in range(rank)))
+        exponents.append(reader.signed_varint(f"exponent of tensor {i}", -MAX_EXPONENT, MAX_EXPONENT))
+        try:
+            names.append(name.decode())
+        except UnicodeDecodeError as error:
+            raise CorruptSection(f"{section}: the name of tensor {i} is not UTF-8") from error
+        previous = name
+    if len(set(names)) < len(names):
+        raise CorruptSection(f"{section}: two tensors have the same name")
+    _check_sizes(section, shapes)
+    if not names:
+        reader.end()
+        return ()
+    arrays = decode_arrays(reader, shapes)
+    return tuple(
+        (name, QuantizedTensor(array, exponent))
+        for name, array, exponent in zip(names, arrays, exponents, strict=True)
+    )
+
+
+def _split(values: np.ndarray, low_bits: int) -> tuple[np.ndarray, np.ndarray]:
+    """High and low part; the low part is centred, so that the high part has the values' own symmetry."""
+    shifted = values + (1 << low_bits >> 1)
+    return shifted >> low_bits, shifted & ((1 << low_bits) - 1)
+
+
+def _join(high: np.ndarray, low: np.ndarray, low_bits: int) -> np.ndarray:
+    return (high.astype(np.int64) << low_bits) + low - (1 << low_bits >> 1)
+
+
+def _cheapest(values: np.ndarray) -> tuple[int, int]:
+    """(Gaussian table, low bits) with the fewest bits, among those near the values' own spread."""
+    if len(values) == 0:
+        return 0, 0
+    tables = gaussian_tables()
+    # In 2^-16 bits: whole numbers, so that ties fall the same way on every machine.
+    costs = np.rint(tables.costs() * 65536).astype(np.int64)
+    best = (-1, 0, 0)
+    spread = np.log2(max(float(np.sqrt(np.mean(values.astype(np.float64) ** 2))), 2.0**-12))
+    first = min(max(0, int(np.floor(spread)) - 5), MAX_LOW_BITS - 2)
+    for low_bits in sorted({0, first, first + 1, first + 2}):
+        high, counts = np.unique(_split(values, low_bits)[0], return_counts=True)
+        near = round(SCALES_PER_OCTAVE * (spread - low_bits - SMALLEST_SCALE_OCTAVE))
+        near = min(max(near, 0), GAUSSIAN_COUNT - 1)
+        for table in range(max(0, near - 24), min(GAUSSIAN_COUNT, near + 13)):
+            j = high - int(tables.lowest[table])
+            beyond = np.where(j < 0, -2 * j - 1, 2 * (j - int(tables.counts[table])))
+            escaped = (j < 0) | (j >= tables.counts[table])
+            cost = costs[tables.offsets[table] + np.where(escaped, tables.counts[table], j)]
+            varint_bytes = 1 + sum((beyond >= (1 << 7 * n)).astype(np.int64) for n in range(1, 5))
+            cost = cost + np.where(escaped, varint_bytes * 8 * 65536, 0)
+            total = int((cost * counts).sum()) + low_bits * len(values) * 65536
+            if best[0] < 0 or total < best[0]:
+                best = (total, table, low_bits)
+    return best[1], best[2]
+
+
+def _shared_prefix(a: bytes, b: bytes) -> int:
+    n = 0
+    while n < min(len(a), len(b)) and a[n] == b[n]:
+        n += 1
+    return n
+
+
+def _check_count(section: str, arrays: Sequence[np.ndarray]) -> None:
+    count = sum(array.size for array in arrays)
+    if count > MAX_WEIGHTS:
+        raise NotEncodable(f"{section}: {count} weights, the format holds at most {MAX_WEIGHTS}")
+
+
+def _check_sizes(section: str, shapes: Sequence[tuple[int, ...]]) -> None:
+    count = 0
+    for shape in shapes:
+        size = 1
+        for n in shape:
+            size *= n
+        count += size
+    if count > MAX_WEIGHTS:
+        raise CorruptSection(f"{section}: {count} weights, the format holds at most {MAX_WEIGHTS}")
