@@ -1,0 +1,68 @@
+"""What people read."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from compgs.cli import console, progress
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (258_143, "258.1 kB"), (1_240_000, "1.24 MB")],
+)
+def test_sizes_are_in_powers_of_1000(count: int, text: str) -> None:
+    assert console.size(count) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.0053, "5.3 ms"), (1.25, "1.25 s"), (245, "4 min 05 s"), (3599.9, "1 h 00 min"), (7380, "2 h 03 min")],
+)
+def test_times_have_a_readable_unit(seconds: float, text: str) -> None:
+    assert console.duration(seconds) == text
+
+
+def test_components_are_shown_with_their_sum(capsys: pytest.CaptureFixture[str]) -> None:
+    console.print_components({"positions": 300, "reference embeddings": 700}, anchors=100, coupled=800)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["positions", "300", "30.0", "%", "24.00", "3.00"]
+    assert lines[3].split() == ["total", "1,000", "100.0", "%", "80.00", "10.00"]
+
+
+@dataclass(frozen=True)
+class Status:
+    step: int
+    steps: int = 100
+    loss: float = 0.05
+    psnr: float = 27.94
+    anchors: int = 4211
+    estimated_bytes: int = 181_000
+    seconds_per_step: float = 0.08
+
+
+def test_a_status_says_rate_loss_quality_anchors_size_and_time_left() -> None:
+    assert (
+        progress.describe(Status(10)) == "12.5 steps/s  loss 0.0500  PSNR 27.9 dB  4,211 anchors  ~181.0 kB"
+    )  # type: ignore[arg-type]
+    assert progress.time_left(Status(10)) == "7.20 s left"  # type: ignore[arg-type]
+
+
+def test_without_a_terminal_progress_is_a_few_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress.training() as show:
+        for step in range(10, 101, 10):
+            show(Status(step))  # type: ignore[arg-type]
+    with progress.counting("reading views") as count:
+        for done in range(1, 6):
+            count(done, 5)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[:24] for line in lines] == [
+        "training: step 10 of 100",
+        "training: step 100 of 10",
+        "reading views: 5 of 5",
+    ]
+
+
+def test_markup_in_names_is_taken_literally(capsys: pytest.CaptureFixture[str]) -> None:
+    console.say("runs/[bold]garden[/bold]")
+    assert capsys.readouterr().out == "runs/[bold]garden[/bold]\n"

@@ -1,0 +1,151 @@
+"""Settings from the command line, and how a run remembers them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from compgs.cli.main import parse
+from compgs.cli.run_folder import RunSettings, SceneSource, file_name, load_settings, save_settings
+from compgs.cli.settings import parse_value, with_settings
+from compgs.cli.train import CHECKPOINT_NAME, Train, forget_earlier_run, interrupted
+from compgs.config import Config, load_config
+from compgs.errors import CheckpointError, ConfigError
+
+
+def train(*arguments: object) -> Train:
+    command = parse(["train", *map(str, arguments)])
+    assert isinstance(command, Train)
+    return command
+
+
+@pytest.mark.parametrize(
+    ("assignment", "section", "key", "value"),
+    [
+        ("training.steps=5000", "training", "steps", 5000),
+        ("training.steps=5_000", "training", "steps", 5000),
+        ("training.lmbda=5e-3", "training", "lmbda", 0.005),
+        ("training.rate=elements", "training", "rate", "elements"),
+        ("training.color_lr=0.01,1e-4", "training", "color_lr", (0.01, 1e-4)),
+        ("training.color_lr=[0.01, 1e-4]", "training", "color_lr", (0.01, 1e-4)),
+        ("model.voxel_size=none", "model", "voxel_size", None),
+        ("model.voxel_size=0.02", "model", "voxel_size", 0.02),
+        ("model.heads=separate", "model", "heads", "separate"),
+        (" control.every = 0.1 ", "control", "every", 0.1),
+    ],
+)
+def test_a_setting_is_read_by_its_type(assignment: str, section: str, key: str, value: Any) -> None:
+    config = with_settings(load_config("paper"), [assignment])
+    assert getattr(getattr(config, section), key) == value
+    assert type(getattr(getattr(config, section), key)) is type(value)
+    expected = load_config("paper").to_dict()
+    expected[section][key] = value
+    assert config.to_dict() == expected
+
+
+@pytest.mark.parametrize(
+    ("assignment", "word"),
+    [
+        ("training.steps=1.5", "whole number"),
+        ("training.steps=", "whole number"),
+        ("training.lmbda=a lot", "a number"),
+        ("training.lmbda=nan", "training.lmbda"),
+        ("training.rate=bytes", "bits or elements"),
+        ("training.color_lr=0.1", "2 numbers"),
+        ("training.color_lr=0.1,x", "a number"),
+        ("trainings.steps=1", "model, entropy, control, training"),
+        ("training.step=1", "steps"),
+        ("model.coupled_primitives=0", "1 to 64"),
+        ("steps=1", "section.key=value"),
+        ("training.steps", "section.key=value"),
+    ],
+)
+def test_a_bad_setting_is_refused_with_what_was_expected(assignment: str, word: str) -> None:
+    with pytest.raises(ConfigError, match=word):
+        with_settings(Config(), [assignment])
+
+
+def test_truth_values_are_words() -> None:
+    assert parse_value(bool, "True") is True
+    assert parse_value(bool, "false") is False
+    with pytest.raises(ValueError, match="true or false"):
+        parse_value(bool, "1")
+
+
+def test_options_with_names_of_their_own_are_settings() -> None:
+    settings = train("scene", "-o", "run", "--lmbda", "0.01", "--steps", "77", "--seed", "5").settings(
+        Path("run")
+    )
+    t = settings.config.training
+    assert (t.lmbda, t.steps, t.seed) == (0.01, 77, 5)
+
+
+def test_flags_of_3dgs_mean_the_same() -> None:
+    theirs = train("-s", "scene", "-m", "run", "-i", "photos", "-r", "4", "--eval", "--iterations", "700")
+    ours = train("scene", "-o", "run", "--images", "photos", "--downscale", "4", "--steps", "700")
+    assert theirs.settings(Path("run")) == ours.settings(Path("run"))
+    assert theirs.output == ours.output
+    underscores = train(
+        "--source_path", "scene", "--model_path", "run", "--images", "photos", "--resolution", "4"
+    )
+    assert underscores.output == ours.output
+    assert underscores.settings(Path("run")).scene == ours.settings(Path("run")).scene
+
+
+def test_a_run_remembers_how_it_began(tmp_path: Path) -> None:
+    begun = train("scene", "-o", tmp_path, "--preset", "quick", "-r", "2", "--no-eval", "--lmbda", "0.003")
+    save_settings(tmp_path, begun.settings(tmp_path))
+    (tmp_path / CHECKPOINT_NAME).touch()
+    assert train("-o", tmp_path, "--resume").settings(tmp_path) == begun.settings(tmp_path)
+    moved = train("elsewhere", "-o", tmp_path, "--resume").settings(tmp_path)
+    assert moved.scene == SceneSource("elsewhere", 2, "images", 8, False)
+    assert moved.config == begun.settings(tmp_path).config
+
+
+@pytest.mark.parametrize("other", [["--lmbda", "0.1"], ["--set", "model.width=64"], ["--preset", "paper"]])
+def test_a_run_is_not_continued_with_other_settings(tmp_path: Path, other: list[str]) -> None:
+    save_settings(tmp_path, train("scene", "-o", tmp_path, "--preset", "quick").settings(tmp_path))
+    (tmp_path / CHECKPOINT_NAME).touch()
+    with pytest.raises(ConfigError, match=r"continue"):
+        train("-o", tmp_path, "--resume", *other).settings(tmp_path)
+
+
+def test_resuming_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
+    save_settings(tmp_path, train("scene", "-o", tmp_path).settings(tmp_path))
+    with pytest.raises(CheckpointError, match=r"checkpoint"):
+        train("-o", tmp_path, "--resume").settings(tmp_path)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"preset": "quick", "scene": {}, "settings": {}}'])
+def test_damaged_run_settings_are_refused_by_name(tmp_path: Path, content: str) -> None:
+    (tmp_path / "config.json").write_text(content)
+    with pytest.raises(CheckpointError, match=r"config\.json"):
+        load_settings(tmp_path)
+
+
+def test_settings_survive_the_file(tmp_path: Path) -> None:
+    config = with_settings(load_config("paper"), ["training.color_lr=0.01,1e-4", "model.voxel_size=0.5"])
+    settings = RunSettings("paper", SceneSource("a folder/ü", 4, "images", 8, True), config)
+    save_settings(tmp_path, settings)
+    assert load_settings(tmp_path) == settings
+    assert json.loads((tmp_path / "config.json").read_text())["settings"]["model"]["voxel_size"] == 0.5
+
+
+def test_the_file_is_named_after_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert file_name(Path("runs/garden")) == "garden.cgs"
+    monkeypatch.chdir(tmp_path)
+    assert file_name(Path(".")) == f"{tmp_path.name}.cgs"
+
+
+def test_overwriting_removes_what_could_be_taken_for_the_new_run(tmp_path: Path) -> None:
+    for name in (CHECKPOINT_NAME, "results.json", f"{tmp_path.name}.cgs", "notes.txt"):
+        (tmp_path / name).touch()
+    forget_earlier_run(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_someone_who_stops_a_run_is_told_how_to_go_on(tmp_path: Path) -> None:
+    assert "before the first checkpoint" in interrupted(tmp_path)
+    (tmp_path / CHECKPOINT_NAME).touch()
+    assert f"compgs train -o {tmp_path} --resume" in interrupted(tmp_path)

@@ -1,0 +1,88 @@
+"""Cameras from files and on circles."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from compgs.cameras import Camera
+from compgs.errors import SceneError
+from compgs.evaluation.camera_path import camera_entry, look_at, orbit, read_cameras
+
+GOOD = camera_entry(Camera(np.eye(4), 100.0, 101.0, 32.0, 24.0, 64, 48), "a view")
+
+
+def test_a_camera_survives_the_file(tmp_path: Path) -> None:
+    pose = look_at(np.array([3.0, -1.0, 2.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
+    camera = Camera(pose, 100.5, 101.25, 31.5, 24.0, 64, 48)
+    (tmp_path / "cameras.json").write_text(json.dumps([GOOD, camera_entry(camera, "b")]))
+    names, cameras = zip(*read_cameras(tmp_path / "cameras.json"), strict=True)
+    assert names == ("a view", "b")
+    np.testing.assert_array_equal(cameras[1].world_to_camera, pose)
+    assert (cameras[1].fx, cameras[1].fy, cameras[1].cx, cameras[1].cy) == (100.5, 101.25, 31.5, 24.0)
+    assert (cameras[1].width, cameras[1].height) == (64, 48)
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        ("", "not a camera file"),
+        ("{}", "list"),
+        ("[]", "none"),
+        ("[3]", "camera 0"),
+        (json.dumps([GOOD, {k: v for k, v in GOOD.items() if k != "fx"}]), "camera 1: 'fx'"),
+        (json.dumps([GOOD | {"width": 0}]), "pixels"),
+        (json.dumps([GOOD | {"width": 10**9}]), "pixels"),
+        (json.dumps([GOOD | {"fx": "wide"}]), "number"),
+        (json.dumps([GOOD | {"fx": -1}]), "focal"),
+        (json.dumps([GOOD | {"world_to_camera": [[1, 2], [3, 4]]}]), "4 rows"),
+        (
+            json.dumps(
+                [GOOD | {"world_to_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]}]
+            ),
+            "rotation",
+        ),
+        (json.dumps([GOOD | {"world_to_camera": (2 * np.eye(4)).tolist()}]), "rotation"),
+        ('[{"world_to_camera": [[NaN,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]', "missing"),
+    ],
+)
+def test_bad_camera_files_are_refused_by_name(tmp_path: Path, content: str, word: str) -> None:
+    path = tmp_path / "path.json"
+    path.write_text(content)
+    with pytest.raises(SceneError, match=word) as caught:
+        read_cameras(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_camera_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"nowhere\.json"):
+        read_cameras(tmp_path / "nowhere.json")
+
+
+@given(
+    st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)).filter(
+        lambda up: np.linalg.norm(up) > 0.1
+    ),
+    st.floats(-80, 80),
+    st.floats(0.5, 5),
+)
+def test_every_camera_of_an_orbit_looks_at_the_middle(up, elevation: float, distance: float) -> None:  # type: ignore[no-untyped-def]
+    positions = np.random.default_rng(0).normal(size=(500, 3)) + [5.0, -2.0, 1.0]
+    middle = np.median(positions, axis=0)
+    cameras = orbit(positions, frames=7, width=64, height=48, up=up, elevation=elevation, distance=distance)
+    direction = np.asarray(up) / np.linalg.norm(up)
+    distances = [np.linalg.norm(camera.center - middle) for _, camera in cameras]
+    np.testing.assert_allclose(distances, distances[0], rtol=1e-9)
+    for _, camera in cameras:
+        x, y, z = camera.rotation @ middle + camera.translation
+        assert z > 0
+        assert abs(camera.fx * x / z) < 1e-6
+        assert abs(camera.fy * y / z) < 1e-6
+        np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(camera.rotation) > 0
+        assert camera.rotation[1] @ direction < 0  # the image's y axis points down
+        height = (camera.center - middle) @ direction / np.linalg.norm(camera.center - middle)
+        assert np.arcsin(height) == pytest.approx(np.deg2rad(elevation), abs=1e-6)

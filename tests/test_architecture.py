@@ -1,0 +1,131 @@
+"""The house's rules: who may import whom, and what decoding must not load."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import compgs
+
+SOURCE = Path(compgs.__file__).parent
+
+# A part may import itself, and the parts named here.
+BASE = {"compgs", "errors", "gaussians", "cameras", "config", "outputs", "presets"}
+ALLOWED = {
+    "compgs": {
+        "errors",
+        "gaussians",
+        "cameras",
+        "config",
+        "scene",
+        "training",
+        "codec",
+        "render",
+        "evaluation",
+    },
+    "errors": set(),
+    "outputs": {"errors"},
+    "gaussians": set(),
+    "cameras": set(),
+    "config": {"errors", "presets"},
+    "presets": set(),
+    "scene": BASE,
+    "render": BASE,
+    "model": BASE,
+    "entropy": BASE,
+    "ssim": BASE,
+    "losses": BASE | {"ssim"},
+    "metrics": BASE | {"ssim"},
+    "trained_model": BASE | {"model", "entropy"},
+    "codec": BASE | {"model", "entropy", "trained_model"},
+    "training": BASE | {"scene", "render", "model", "entropy", "ssim", "losses", "metrics", "trained_model"},
+    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec"},
+    "cli": BASE | {"scene", "render", "model", "metrics", "codec", "training", "evaluation", "trained_model"},
+    "__main__": BASE | {"cli"},
+}
+
+
+def part_of(module: str) -> str:
+    """`compgs.scene.colmap` belongs to `scene`; `compgs` is the package's own __init__."""
+    names = module.split(".")
+    return names[1] if len(names) > 1 else "compgs"
+
+
+def imported_parts(file: Path) -> set[str]:
+    """Parts of the package that a source file imports, anywhere in it."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {part_of(alias.name) for alias in node.names if alias.name.split(".")[0] == "compgs"}
+        elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "compgs":
+            if node.module == "compgs":
+                submodules = {p.stem for p in SOURCE.iterdir()}
+                found |= {alias.name if alias.name in submodules else "compgs" for alias in node.names}
+            else:
+                found.add(part_of(node.module))
+    return found
+
+
+@pytest.mark.parametrize("file", sorted(SOURCE.rglob("*.py")), ids=lambda f: str(f.relative_to(SOURCE)))
+def test_imports_point_one_way(file: Path) -> None:
+    relative = file.relative_to(SOURCE).with_suffix("").parts
+    part = "compgs" if relative == ("__init__",) else relative[0]
+    assert part in ALLOWED, f"{part} is new: say in this test what it may import"
+    assert imported_parts(file) <= ALLOWED[part] | {part}
+
+
+def test_only_the_command_line_prints() -> None:
+    printing = [
+        str(file.relative_to(SOURCE))
+        for file in SOURCE.rglob("*.py")
+        if file.relative_to(SOURCE).parts[0] != "cli"
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    ]
+    assert printing == []
+
+
+def modules_after(statement: str) -> set[str]:
+    """Names of the modules loaded in a fresh interpreter after a statement."""
+    program = f"import sys; {statement}; print('\\n'.join(sys.modules))"
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("COV")}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True
+    )
+    return set(done.stdout.split())
+
+
+def test_importing_the_package_loads_neither_torch_nor_numba() -> None:
+    loaded = modules_after("import compgs")
+    assert "compgs" in loaded
+    assert not loaded & {"torch", "numba", "scipy", "PIL"}
+
+
+def test_the_command_line_starts_without_torch() -> None:
+    loaded = modules_after("import compgs.cli.main")
+    assert "tyro" in loaded
+    assert not loaded & {"torch", "numba", "scipy", "PIL"}
+
+
+def test_decoding_never_loads_scenes_losses_or_training() -> None:
+    loaded = modules_after("import compgs.codec.decoder")
+    assert "compgs.codec.decoder" in loaded
+    forbidden = {"scene", "losses", "ssim", "metrics", "training", "evaluation", "cli", "trained_model"}
+    assert not {m for m in loaded if m.startswith("compgs.") and part_of(m) in forbidden}
+
+
+@pytest.mark.parametrize(
+    "module", ["rans", "tables", "integer_network", "octree", "mask_coder", "weights", "reader"]
+)
+def test_from_bytes_to_symbols_no_torch_is_loaded(module: str) -> None:
+    loaded = modules_after(f"import compgs.codec.{module}")
+    assert f"compgs.codec.{module}" in loaded
+    assert "torch" not in loaded
+
+
+def test_public_names_exist() -> None:
+    for name in compgs.__all__:
+        assert getattr(compgs, name) is not None
