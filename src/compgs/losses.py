@@ -1,0 +1,102 @@
+"""The objective of training (CompGS Sec. 3.3 and 3.4), on one page.
+
+    loss = D + lambda R
+    D    = (1 - w) L1 + w (1 - SSIM) + scale_weight * mean product of the primitives' scales
+
+R is made of the bits of the anchors in view, of five streams: reference and residual embeddings, their
+hyperpriors, and the covariance parameters. It can be normalized in two ways:
+
+- "elements", as the authors' release: the sum over the streams of their mean bits per element. A bit of a
+small
+  stream weighs more than one of a large stream: twenty times for a hyperprior against the residual
+  embeddings.
+- "bits": 5 * all bits / elements of all streams. Every bit weighs the same, as it does in the file. The
+factor 5, the
+  number of streams, makes lambda mean about the same as with "elements": with as many bits per element in
+  every stream, both are equal. With 32 + 6 + 80 + 4 + 10 = 132 elements an anchor, R = 5 bits / (132
+  anchors).
+
+Bits themselves are counted in `entropy`; only this module divides them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from compgs.ssim import l1_and_ssim, ssim
+
+
+@dataclass(frozen=True)
+class Target:
+    """A photograph to compare with: its 8-bit pixels, 3 bytes each, on the renderer's device.
+
+    Its local means and variances are not kept: to compute them again costs about a fifth of the loss, to keep
+    them would take 24 bytes a pixel, nine times the memory of the photographs.
+    """
+
+    image: Tensor  # [H, W, 3] uint8
+
+    @staticmethod
+    def from_image(image: np.ndarray, device: torch.device | str = "cpu") -> "Target":
+        """From uint8 [H, W, 3]; on the CPU it shares the array's memory where it can."""
+        return Target(torch.as_tensor(np.ascontiguousarray(image)).to(device))
+
+
+def photometric_loss(
+    image: Tensor,  # [H, W, 3] rendered, 0 to 1
+    target: Target | Tensor,  # [H, W, 3] uint8, or of the image's type and 0 to 1
+    ssim_weight: float = 0.2,
+) -> Tensor:
+    """(1 - w) L1 + w (1 - SSIM), as in 3DGS."""
+    y = target.image if isinstance(target, Target) else target
+    assert image.shape == y.shape, f"image {tuple(image.shape)}, target {tuple(y.shape)}"
+    if (
+        image.device.type == "cpu"
+        and image.dtype == torch.float32
+        and y.dtype in (torch.uint8, torch.float32)
+    ):
+        return _FusedPhotometric.apply(image, y, ssim_weight)
+    if y.dtype == torch.uint8:
+        y = y.to(image.dtype) / 255.0
+    return (1.0 - ssim_weight) * (image - y).abs().mean() + ssim_weight * (1.0 - ssim(image, y))
+
+
+class _FusedPhotometric(torch.autograd.Function):
+    """The gradient is computed along with the loss: both need the same local means."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+        x, y = image.detach().contiguous().numpy(), target.detach().contiguous().numpy()
+        l1, similarity, gradient = l1_and_ssim(x, y, ssim_weight, want_gradient=ctx.needs_input_grad[0])
+        if gradient is not None:
+            ctx.save_for_backward(torch.from_numpy(gradient))
+        return image.new_tensor((1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - similarity))
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * grads[0], None, None
+
+
+def scale_regularizer(scales: Tensor) -> Tensor:
+    """Mean product of the three scales, [M, 3] world units: large primitives are expensive to render."""
+    return scales.prod(1).mean()
+
+
+def rate(bits: Mapping[str, Tensor], elements: Mapping[str, int], normalization: str) -> Tensor:
+    """R from the bits of each stream (any shape) and its number of elements; see the module's docstring."""
+    assert bits.keys() == elements.keys() and bits, f"bits of {list(bits)}, elements of {list(elements)}"
+    totals = {name: b.sum() for name, b in bits.items()}
+    if normalization == "elements":
+        return torch.stack([totals[name] / elements[name] for name in totals]).sum()
+    assert normalization == "bits", f"unknown normalization {normalization!r}"
+    return len(totals) * torch.stack(list(totals.values())).sum() / sum(elements.values())
+
+
+def rate_distortion_loss(distortion: Tensor, rate: Tensor, lmbda: float) -> Tensor:
+    """D + lambda R (CompGS Sec. 3.3). lambda weighs the rate; CompressAI's `lmbda` weighs the distortion."""
+    return distortion + lmbda * rate

@@ -1,0 +1,102 @@
+"""Image quality: PSNR, SSIM, LPIPS. Every number the project reports follows these conventions.
+
+- Images are uint8 [H, W, 3], display RGB: a rendering is *rounded* to 8 bits (`to_8bit`), as a file would be,
+not
+  truncated and not left in floating point.
+- PSNR: of the mean squared error over pixels and channels, data range 255; identical images give infinity. -
+SSIM: 11 x 11 Gaussian window, sigma 1.5, zeros outside the image, data range 1, C1 = 0.01^2, C2 = 0.03^2,
+mean over
+  pixels and channels: the one of 3DGS (`compgs.ssim`).
+- LPIPS: network "vgg" as in 3DGS unless "alex" is asked for, version 0.1 through torchmetrics, inputs in
+  [-1, 1]. The releases of 3DGS and CompGS feed [0, 1]: their figures are not comparable.
+
+A metric over views is the mean of the views' metrics.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from compgs.errors import MissingDependency
+from compgs.ssim import l1_and_ssim
+
+# Distance of two batches [1, 3, H, W] in [-1, 1].
+LpipsNetwork = Callable[[Tensor, Tensor], Tensor]
+
+
+class Unavailable(MissingDependency):
+    """A metric that cannot be computed here; the message is the reason, for reports to print."""
+
+
+def to_8bit(image: Tensor) -> np.ndarray:
+    """[H, W, 3] rendered, 0 to 1 -> uint8: clamped and rounded."""
+    return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+
+
+def _check(a: np.ndarray, b: np.ndarray) -> None:
+    for image in (a, b):
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise ValueError(
+                f"expected uint8 images [H, W, 3] (see to_8bit), found {image.dtype} {list(image.shape)}"
+            )
+    if a.shape != b.shape:
+        raise ValueError(f"images of different size: {list(a.shape[:2])} and {list(b.shape[:2])} (H, W)")
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB of uint8 images [H, W, 3]."""
+    _check(a, b)
+    difference = a.astype(np.int32) - b.astype(np.int32)
+    error = float(np.mean(np.square(difference), dtype=np.float64))
+    return math.inf if error == 0.0 else 10.0 * math.log10(255.0**2 / error)
+
+
+def ssim(a: np.ndarray, b: np.ndarray) -> float:
+    """Structural similarity of uint8 images [H, W, 3]; 1 for identical images."""
+    _check(a, b)
+    x = a.astype(np.float32) / np.float32(255.0)
+    return l1_and_ssim(np.ascontiguousarray(x), np.ascontiguousarray(b))[1]
+
+
+def lpips(a: np.ndarray, b: np.ndarray, network: LpipsNetwork | Literal["vgg", "alex"] = "vgg") -> float:
+    """Learned perceptual distance (Zhang et al. 2018) of uint8 images [H, W, 3]; 0 for identical images.
+
+    Raises Unavailable where the package or the network's weights are missing; nothing is downloaded.
+    """
+    _check(a, b)
+    distance = lpips_network(network) if isinstance(network, str) else network
+    inputs = [torch.tensor(image).permute(2, 0, 1)[None].float() / 127.5 - 1.0 for image in (a, b)]
+    with torch.no_grad():
+        return float(distance(*inputs))
+
+
+@functools.cache
+def lpips_network(name: Literal["vgg", "alex"]) -> LpipsNetwork:
+    """The network with its published weights: torchmetrics, and a backbone in torch's folder of checkpoints."""
+    try:
+        import torchvision
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+    except (ImportError, RuntimeError) as error:  # a torchvision for another torch fails with RuntimeError
+        raise Unavailable(
+            f"LPIPS needs torchmetrics and torchvision ({error}): pip install compgs[lpips]"
+        ) from error
+    models = torchvision.models
+    weights = {"vgg": models.VGG16_Weights, "alex": models.AlexNet_Weights}[name].IMAGENET1K_V1
+    file = Path(torch.hub.get_dir()) / "checkpoints" / weights.url.rsplit("/", 1)[1]
+    if not file.is_file():
+        remedy = f"torchvision.models.{'vgg16' if name == 'vgg' else 'alexnet'}(weights='IMAGENET1K_V1')"
+        raise Unavailable(f"LPIPS needs {file}, which is missing; `{remedy}` in Python downloads it")
+    network = LearnedPerceptualImagePatchSimilarity(net_type=name, normalize=False)
+    network.eval()
+
+    def distance(a: Tensor, b: Tensor) -> Tensor:
+        network.reset()
+        return network(a, b)
+
+    return distance
