@@ -31,9 +31,9 @@ def load_scene(
     background: tuple[float, float, float] | None = None,  # display RGB, 0 to 1; None: the layout's
     progress: Progress | None = None,  # called with (done, total) views
 ) -> Scene:
-    """Reads a capture of COLMAP (binary or text), Blender (`transforms_train.json`) or nerfstudio (`transforms.json`).
+    """Reads a capture: COLMAP, Blender (`transforms_train.json`) or nerfstudio (`transforms.json`).
 
-    Raises SceneError or one of its kinds for missing, damaged or contradicting data, ConfigError for settings.
+    Raises SceneError or one of its kinds for missing, damaged or contradicting data, else ConfigError.
     """
     if downscale < 1 or int(downscale) != downscale:
         raise ConfigError(f"downscale {downscale}: expected a whole number from 1")
@@ -78,8 +78,8 @@ def _read_layout(folder: Path, images: str) -> Capture:
     else:
         raise MissingSparseModel(
             f"{folder}: no camera poses found; expected a COLMAP sparse model (cameras.bin, images.bin and "
-            f"points3D.bin in sparse/0), transforms_train.json (Blender) or transforms.json (nerfstudio). For "
-            f"photographs alone, run: colmap automatic_reconstructor --workspace_path {folder} "
+            f"points3D.bin in sparse/0), transforms_train.json (Blender) or transforms.json (nerfstudio). "
+            f"For photographs alone, run: colmap automatic_reconstructor --workspace_path {folder} "
             f"--image_path {folder / images}"
         )
     return replace(capture, images=tuple(sorted(capture.images, key=lambda posed: posed.name)))
@@ -135,8 +135,8 @@ def _enough_points(capture: Capture, views: list[View]) -> tuple[Points, tuple[s
         np.concatenate([capture.points.colors, random.colors]),
     )
     note = (
-        f"{capture.points_source} has {found} points, too few to start from: {len(random)} random ones were added "
-        f"where the cameras look"
+        f"{capture.points_source} has {found} points, too few to start from: {len(random)} random ones were "
+        f"added where the cameras look"
     )
     return both, (note,)
 

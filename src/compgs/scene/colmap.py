@@ -1,7 +1,7 @@
 """COLMAP sparse models, binary and text: cameras, images and points3D, as COLMAP's documentation has them.
 
-A model is read as it stands: ids may have gaps, observations may lie outside their image or belong to no point
-(id -1), names may hold folders and spaces. What would make it unusable is refused with the file's name.
+A model is read as it stands: ids may have gaps, observations may lie outside their image or belong to no
+point (id -1), names may hold folders and spaces. What makes it unusable is refused with the file's name.
 """
 
 import struct
@@ -100,8 +100,8 @@ def read_sparse_model(folder: Path) -> SparseModel:
         kind = max(("bin", "txt"), key=lambda k: sum((folder / f"{p}.{k}").is_file() for p in _PARTS))
         missing = next(p for p in _PARTS if not (folder / f"{p}.{kind}").is_file())
         raise MissingSparseModel(
-            f"{folder}: {missing}.bin (or .txt) is missing; a sparse model is the three files cameras, images "
-            f"and points3D, as `colmap mapper` writes them"
+            f"{folder}: {missing}.bin (or .txt) is missing; a sparse model is the three files cameras, "
+            f"images and points3D, as `colmap mapper` writes them"
         )
     binary = kinds[0] == "bin"
     cameras_file, images_file, points_file = (folder / f"{p}.{kinds[0]}" for p in _PARTS)
@@ -112,7 +112,8 @@ def read_sparse_model(folder: Path) -> SparseModel:
         if image.camera_id not in cameras:
             raise SceneError(
                 f"{images_file}: image {image.name!r} was taken by camera {image.camera_id}, but "
-                f"{cameras_file.name} only knows {', '.join(map(str, sorted(cameras))) or 'none'}; export the model again"
+                f"{cameras_file.name} only knows {', '.join(map(str, sorted(cameras))) or 'none'}; "
+                f"export the model again"
             )
     return SparseModel(folder, cameras, images, points)
 

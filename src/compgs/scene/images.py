@@ -134,7 +134,7 @@ class _Maps:
 
 
 def _in_threads(work: Callable[[int], _Result], count: int, progress: Progress | None) -> list[_Result]:
-    """[work(0), work(1), ...]. Of all the images' errors the first is raised; it says how many more there are."""
+    """[work(0), work(1), ...]. Of the images' errors the first is raised; it says how many more there are."""
     results: dict[int, _Result] = {}
     errors: dict[int, SceneError] = {}
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:

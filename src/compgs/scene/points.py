@@ -55,8 +55,8 @@ def median_spacing(positions: np.ndarray) -> float:  # positions: [P, 3] world u
 def fallback_points(cameras: Sequence[Camera], count: int, seed: int = 0) -> Points:
     """Random gray points where the cameras look, for scenes whose sparse points are too few.
 
-    Each point lies at a random pixel of a random camera. Its depth is drawn around the distance of the point that
-    all cameras look at (closest to their axes), or, where they look apart, around the size of their path.
+    Each point lies at a random pixel of a random camera. Its depth is drawn around the distance of the point
+    that all cameras look at (closest to their axes) or, where they look apart, of the size of their path.
     """
     rng = np.random.default_rng(seed)
     centers = np.stack([camera.center for camera in cameras])
@@ -79,7 +79,7 @@ def fallback_points(cameras: Sequence[Camera], count: int, seed: int = 0) -> Poi
 
 
 def _closest_to_axes(centers: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """[3] the point with the least squared distance to the lines through centers [V, 3] along directions [V, 3]."""
+    """[3] the point of least squared distance to the lines from centers [V, 3] along directions [V, 3]."""
     across = (
         np.eye(3) - directions[:, :, None] * directions[:, None, :]
     )  # projects onto the plane across the axis

@@ -1,17 +1,17 @@
 """Lens distortion: forward models, and images as a pinhole camera would have taken them.
 
-`x, y` are normalized image coordinates: a point in camera axes divided by its depth. Distorted ones, multiplied by
-the focal lengths, are pixels from the principal point. Only the forward equations are needed: every pixel of the
-undistorted image asks where the lens has put it.
+`x, y` are normalized image coordinates: a point in camera axes divided by its depth. Distorted ones,
+multiplied by the focal lengths, are pixels from the principal point. Only the forward equations are needed:
+every pixel of the undistorted image asks where the lens has put it.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 
 from compgs.cameras import Camera
+from compgs.errors import UnsupportedCamera
 
 MODELS = (
     "SIMPLE_RADIAL",
@@ -90,45 +90,48 @@ def _field_of_view(x: np.ndarray, y: np.ndarray, omega: float) -> tuple[np.ndarr
 
 
 def undistorted_camera(camera: Camera, lens: Distortion) -> Camera:
-    """The pinhole camera with the same pose and focal lengths that sees as much as it can of the image and
-    nothing beyond its edges."""
+    """The pinhole camera with the same pose and focal lengths that sees as much as it can of the image, and
+    nothing beyond its edges. Raises UnsupportedCamera where the lens leaves nothing worth seeing."""
     full = np.array([camera.cx, camera.cy, camera.width - camera.cx, camera.height - camera.cy])
     focal = np.array([camera.fx, camera.fy, camera.fx, camera.fy])
-    # Sides: distance of the left, top, right, bottom edge from the axis, in undistorted normalized units. First
-    # all four grow together from the axis, then each on its own, until its edge would look past the image.
-    sides = full / focal
-    sides = sides * _largest(lambda t: _sees_only_image(sides * t, camera, lens))
-    for side in (0, 2, 1, 3):
-        limit = 2 * full[side] / focal[side]  # twice: an inscribed fisheye image could be endless
-        room = max(limit - sides[side], 0.0)
-        grown = np.eye(4)[side] * room
-        sides = sides + grown * _largest(
-            lambda t, s=sides, g=grown: _sees_only_image(s + g * t, camera, lens), 1.0
+    if full.min() <= 0:
+        raise UnsupportedCamera(
+            f"the principal point ({camera.cx:g}, {camera.cy:g}) of a lens with distortion lies outside of its "
+            f"image of {camera.width}x{camera.height} pixels; calibrate again"
         )
-    left, top, right, bottom = sides * focal
-    return replace(
-        camera,
-        cx=float(left),
-        cy=float(top),
-        width=max(1, int(left + right)),
-        height=max(1, int(top + bottom)),
-    )
 
+    def largest(sides: np.ndarray, growth: np.ndarray, top: float) -> np.ndarray:
+        """sides + t growth for the largest t in [0, top] up to which only the image is seen, to 1e-5 of t."""
+        # Walked from 0, then halved: far outside, polynomials fold back and look valid again.
+        steps = np.linspace(0.0, top, 65).tolist()
+        bad = next((t for t in steps[1:] if not _sees_only_image(sides + t * growth, camera, lens)), None)
+        if bad is None:
+            return sides + top * growth
+        good = bad - steps[1]
+        while bad - good > 1e-5:
+            middle = (good + bad) / 2
+            if _sees_only_image(sides + middle * growth, camera, lens):
+                good = middle
+            else:
+                bad = middle
+        return sides + good * growth
 
-def _largest(holds: Callable[[float], bool], top: float = 2.0) -> float:
-    """The largest t in [0, top] up to which `holds` is true, to 1e-5."""
-    steps = np.linspace(0.0, top, 65).tolist()
-    # walked from 0: polynomials fold back far outside, where they look valid again
-    good = 0
-    while good + 1 < len(steps) and holds(steps[good + 1]):
-        good += 1
-    if good + 1 == len(steps):
-        return top
-    low, high = steps[good], steps[good + 1]
-    while high - low > 1e-5:
-        middle = (low + high) / 2
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return low
+    # Sides: distance of the left, top, right, bottom edge from the axis, in undistorted normalized units.
+    # First all four grow together from the axis, then each on its own, until its edge would look past the image.
+    # At most to twice the distance without a lens: the image of a fisheye lens could be endless.
+    sides = largest(np.zeros(4), full / focal, 2.0)
+    for side in (0, 2, 1, 3):
+        growth = np.zeros(4)
+        growth[side] = max(2 * full[side] / focal[side] - sides[side], 0.0)
+        sides = largest(sides, growth, 1.0)
+    left, top, right, bottom = (sides * focal).tolist()
+    width, height = int(left + right + 1e-6), int(top + bottom + 1e-6)
+    if width * height < 0.05 * camera.width * camera.height or min(width, height) < 1:
+        raise UnsupportedCamera(
+            f"the distortion {lens.model} {lens.coefficients} leaves {width}x{height} of {camera.width}x"
+            f"{camera.height} pixels when it is undone; calibrate again"
+        )
+    return replace(camera, cx=left, cy=top, width=width, height=height)
 
 
 def _sees_only_image(sides: np.ndarray, camera: Camera, lens: Distortion) -> bool:
