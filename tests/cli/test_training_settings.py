@@ -94,12 +94,14 @@ def test_flags_of_3dgs_mean_the_same() -> None:
 
 
 def test_a_run_remembers_how_it_began(tmp_path: Path) -> None:
-    begun = train("scene", "-o", tmp_path, "--preset", "quick", "-r", "2", "--no-eval", "--lmbda", "0.003")
+    begun = train(
+        "scene", "-o", tmp_path, "--preset", "quick", "-r", "2", "--no-eval", "--background", "0.5", "0", "1"
+    )
     save_settings(tmp_path, begun.settings(tmp_path))
     (tmp_path / CHECKPOINT_NAME).touch()
     assert train("-o", tmp_path, "--resume").settings(tmp_path) == begun.settings(tmp_path)
     moved = train("elsewhere", "-o", tmp_path, "--resume").settings(tmp_path)
-    assert moved.scene == SceneSource("elsewhere", 2, "images", 8, False)
+    assert moved.scene == SceneSource("elsewhere", 2, "images", 8, False, (0.5, 0.0, 1.0))
     assert moved.config == begun.settings(tmp_path).config
 
 
@@ -126,7 +128,7 @@ def test_damaged_run_settings_are_refused_by_name(tmp_path: Path, content: str) 
 
 def test_settings_survive_the_file(tmp_path: Path) -> None:
     config = with_settings(load_config("paper"), ["training.color_lr=0.01,1e-4", "model.voxel_size=0.5"])
-    settings = RunSettings("paper", SceneSource("a folder/ü", 4, "images", 8, True), config)
+    settings = RunSettings("paper", SceneSource("a folder/ü", 4, "images", 8, True, None), config)
     save_settings(tmp_path, settings)
     assert load_settings(tmp_path) == settings
     assert json.loads((tmp_path / "config.json").read_text())["settings"]["model"]["voxel_size"] == 0.5

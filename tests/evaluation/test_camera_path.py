@@ -70,7 +70,7 @@ def test_a_missing_camera_file_is_named(tmp_path: Path) -> None:
     st.floats(0.5, 5),
 )
 def test_every_camera_of_an_orbit_looks_at_the_middle(up, elevation: float, distance: float) -> None:  # type: ignore[no-untyped-def]
-    positions = np.random.default_rng(0).normal(size=(500, 3)) + [5.0, -2.0, 1.0]
+    positions = np.random.default_rng(0).normal((5.0, -2.0, 1.0), 1.0, (500, 3))
     middle = np.median(positions, axis=0)
     cameras = orbit(positions, frames=7, width=64, height=48, up=up, elevation=elevation, distance=distance)
     direction = np.asarray(up) / np.linalg.norm(up)

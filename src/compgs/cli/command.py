@@ -6,6 +6,7 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from compgs.cli.run_folder import SceneSource
 from compgs.errors import ConfigError
 
 NO_DEFAULT = ""  # instead of "(default: None)" in the help
@@ -72,6 +73,16 @@ class SceneOptions:
 
     test_every: Annotated[int, arg(metavar="N")] = 8
     """Every N-th view, by name, is held out for evaluation."""
+
+    background: Annotated[
+        tuple[float, float, float] | None, arg(metavar="R G B", help_behavior_hint=NO_DEFAULT)
+    ] = None
+    """Color behind everything, 0 to 1; by default white for Blender scenes with transparency, else black."""
+
+    def scene_source(self, *, holdout: bool = True) -> SceneSource:
+        """Raises UsageError if not exactly one scene was given."""
+        path = str(one_scene(self.scene, self.source))
+        return SceneSource(path, self.downscale, self.images, self.test_every, holdout, self.background)
 
 
 def one_scene(scene: Path | None, source: Path | None) -> Path:

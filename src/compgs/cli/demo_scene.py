@@ -1,5 +1,6 @@
 """`compgs demo-scene`: a scene to try the program on."""
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +10,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from compgs.cli.command import Command, UsageError
 from compgs.cli.console import say
 from compgs.cli.progress import counting
+from compgs.errors import OutputError
 from compgs.outputs import check_output_folder
 
 
@@ -37,7 +39,7 @@ class DemoScene(Command):
     """Of everything random."""
 
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace what is in FOLDER already."""
+    """Replace a scene that is in FOLDER already."""
 
     def run(self) -> None:
         if not (
@@ -47,15 +49,34 @@ class DemoScene(Command):
         ):
             raise UsageError("--views must be 2 to 10000, --width and --height 16 to 8192")
         check_output_folder(self.folder, overwrite=self.overwrite)
+        if self.overwrite:
+            check_only_a_scene(self.folder)
         from compgs.scene.generated import generate_scene
 
+        # An earlier scene stays until the new one is complete.
+        earlier = self.folder.is_dir() and any(self.folder.iterdir())
+        target = self.folder.with_name(f".{self.folder.name}.new") if earlier else self.folder
+        if earlier:
+            shutil.rmtree(target, ignore_errors=True)
         with counting("ray tracing") as progress:
             generate_scene(
-                self.folder,
+                target,
                 views=self.views,
                 width=self.width,
                 height=self.height,
                 seed=self.seed,
                 progress=progress,
             )
+        if earlier:
+            shutil.rmtree(self.folder)
+            target.rename(self.folder)
         say(f"{self.folder}: {self.views} views, {self.width} x {self.height}, in COLMAP's layout")
+
+
+def check_only_a_scene(folder: Path) -> None:
+    """Raises OutputError if a folder that is to be replaced holds anything else than a scene."""
+    others = [path for path in folder.glob("*") if path.name not in ("images", "sparse")]
+    if others:
+        raise OutputError(
+            f"{others[0]}: not part of a scene, so {folder} is not replaced; choose another folder"
+        )

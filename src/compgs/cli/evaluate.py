@@ -6,11 +6,10 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument, SceneOptions, one_scene
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument, SceneOptions
 from compgs.cli.console import print_results, say
 from compgs.cli.inputs import check_bitstream
 from compgs.cli.progress import counting
-from compgs.cli.run_folder import SceneSource
 from compgs.cli.scenes import read_scene
 from compgs.outputs import check_output_folder
 
@@ -43,11 +42,11 @@ class Evaluate(ComputingCommand, SceneOptions, FileArgument):
         check_bitstream(self.file)
         if self.output is not None:
             check_output_folder(self.output, overwrite=self.overwrite)
-        path = one_scene(self.scene, self.source)
+        source = self.scene_source()
         self.prepare()
         from compgs.evaluation import evaluate
 
-        scene = read_scene(SceneSource(str(path), self.downscale, self.images, self.test_every, True))
+        scene = read_scene(source)
         with counting("evaluating views") as progress:
             results = evaluate(
                 self.file,

@@ -12,7 +12,6 @@ from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument, Scene
 from compgs.cli.console import duration, say
 from compgs.cli.inputs import check_bitstream
 from compgs.cli.progress import counting
-from compgs.cli.run_folder import SceneSource
 from compgs.cli.scenes import read_scene
 from compgs.outputs import check_output_folder, write_bytes, write_json
 
@@ -95,10 +94,9 @@ class Render(ComputingCommand, SceneOptions, FileArgument):
             from compgs.evaluation.camera_path import read_cameras
 
             return read_cameras(self.cameras)
-        path = self.scene or self.source
-        if path is None:
+        if self.scene is None and self.source is None:
             return []
-        scene = read_scene(SceneSource(str(path), self.downscale, self.images, self.test_every, True))
+        scene = read_scene(self.scene_source())
         chosen = {
             "test": scene.test_views,
             "train": scene.train_views,

@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from compgs import __version__
 from compgs.config import Config, config_from_dict
@@ -23,6 +24,7 @@ class SceneSource:
     images: str
     test_every: int
     holdout: bool
+    background: tuple[float, float, float] | None  # RGB, 0 to 1
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ def load_settings(folder: Path) -> RunSettings:
         content = json.loads(path.read_text(encoding="utf-8"))
         return RunSettings(
             preset=str(content["preset"]),
-            scene=SceneSource(**content["scene"]),
+            scene=_scene_source(content["scene"]),
             config=config_from_dict(content["settings"], str(path)),
         )
     except FileNotFoundError as error:
@@ -68,3 +70,8 @@ def load_settings(folder: Path) -> RunSettings:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path}: not the settings of a run ({error}); train anew") from error
+
+
+def _scene_source(values: dict[str, Any]) -> SceneSource:
+    background = values["background"]
+    return SceneSource(**{**values, "background": None if background is None else tuple(background)})

@@ -22,6 +22,7 @@ def read_scene(source: SceneSource) -> "Scene":
             images=source.images,
             test_every=source.test_every,
             holdout=source.holdout,
+            background=source.background,
             progress=progress,
         )
     first = (scene.train_views or scene.test_views)[0].camera

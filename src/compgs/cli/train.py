@@ -14,7 +14,6 @@ from compgs.cli.run_folder import (
     CHECKPOINT_NAME,
     TRAINING_NAME,
     RunSettings,
-    SceneSource,
     file_name,
     load_settings,
     save_settings,
@@ -112,8 +111,7 @@ class Train(ComputingCommand, SceneOptions):
         """From the command line, or of the run to be continued. Raises ConfigError, CheckpointError."""
         if not self.resume:
             preset = self.preset or "default"
-            path = one_scene(self.scene, self.source)
-            source = SceneSource(str(path), self.downscale, self.images, self.test_every, self.eval)
+            source = self.scene_source(holdout=self.eval)
             return RunSettings(preset, source, with_settings(load_config(preset), self.assignments()))
         begun = load_settings(folder)
         if not (folder / CHECKPOINT_NAME).is_file():

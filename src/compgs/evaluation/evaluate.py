@@ -112,13 +112,8 @@ def evaluate(
 def timed_render(model: HybridModel, camera: Camera) -> tuple[np.ndarray, float]:
     """[H, W, 3] uint8, and the seconds it took until the image was there."""
     start = time.perf_counter()
-    image = to_uint8(render(model, camera).image)
+    image = metrics.to_8bit(render(model, camera).image)
     return image, time.perf_counter() - start
-
-
-def to_uint8(image: torch.Tensor) -> np.ndarray:
-    """[H, W, 3] floats, 0 to 1, rounded to the nearest of 256 levels."""
-    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def component_bytes(data: bytes) -> dict[str, int]:

@@ -8,7 +8,7 @@
 | compgs | version of the program that evaluated |
 | scene, file | names |
 | views, width, height | number of held-out views; pixels of the first |
-| psnr | dB, mean over the views |
+| psnr | dB, mean over the views; null if infinite: all renderings are perfect |
 | ssim | mean over the views |
 | lpips | mean over the views, or null; `lpips_note` then says why |
 | bytes | of the whole file |

@@ -1,0 +1,174 @@
+"""The main job on a tiny scene: photographs in, one file out, views rendered from that file by another process."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import compgs
+from compgs.cli import train as train_command
+from compgs.cli.main import main
+from compgs.metrics import psnr, to_8bit
+from compgs.training import TrainingStatus
+
+pytestmark = pytest.mark.slow
+
+STEPS = 60
+OPTIONS = ["--preset", "quick", "--steps", str(STEPS), "--seed", "7"]
+
+
+def in_a_new_process(*arguments: object) -> str:
+    """Standard output of `compgs` with these arguments."""
+    command = [sys.executable, "-m", "compgs", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data") / "scene"
+    assert main(["demo-scene", str(folder), "--views", "12", "--width", "96", "--height", "72"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, scene_folder: Path) -> Path:
+    """The folder of a finished run, named `tiny`."""
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    assert main(["train", str(scene_folder), "-o", str(folder), *OPTIONS]) == 0
+    return folder
+
+
+def test_a_run_leaves_everything_it_promises(run: Path) -> None:
+    names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
+    views = {f"test/{kind}/0000{i}.png" for kind in ("renders", "gt") for i in range(2)}
+    expected = {"tiny.cgs", "results.json", "per_view.json", "config.json", "training.json", "cameras.json"}
+    assert names >= expected | views | {"contact_sheet.png", "checkpoint.safetensors"}
+    assert not [name for name in names if "partial" in name]
+
+
+def test_another_process_finds_what_the_training_reported(
+    run: Path, scene_folder: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "report"
+    shown = in_a_new_process("evaluate", run / "tiny.cgs", scene_folder, "-o", output)
+    theirs = json.loads((run / "results.json").read_text())
+    ours = json.loads((output / "results.json").read_text())
+    for key in ("sha256", "bytes", "components", "anchors", "coupled_primitives", "psnr", "ssim"):
+        assert ours[key] == theirs[key]
+    assert ours["bytes"] == (run / "tiny.cgs").stat().st_size == sum(ours["components"].values())
+    assert f"{ours['psnr']:.2f} dB" in shown
+    assert f"{ours['bytes']:,} bytes" in shown
+
+
+def test_the_scene_is_recognizable_after_a_few_steps(run: Path) -> None:
+    results = json.loads((run / "results.json").read_text())
+    # A gray image of the right brightness has about 14 dB on this scene.
+    assert results["psnr"] > 16
+    assert results["views"] == 2
+
+
+def test_encoding_a_run_again_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
+    in_a_new_process("encode", run, "-o", tmp_path / "again.cgs")
+    assert (tmp_path / "again.cgs").read_bytes() == (run / "tiny.cgs").read_bytes()
+
+
+def test_symbols_do_not_depend_on_the_number_of_threads(run: Path, tmp_path: Path) -> None:
+    for threads in (1, 2):
+        in_a_new_process("decode", run / "tiny.cgs", "-o", tmp_path / str(threads), "--threads", threads)
+    with np.load(tmp_path / "1" / "latents.npz") as one, np.load(tmp_path / "2" / "latents.npz") as two:
+        assert set(one) == set(two) == {"positions", "log_scales", "references", "residuals", "anchor_index"}
+        for name in one:
+            np.testing.assert_array_equal(one[name], two[name])
+
+
+def test_info_and_render_need_nothing_but_the_file(run: Path, tmp_path: Path) -> None:
+    shown = in_a_new_process("info", run / "tiny.cgs")
+    assert f"{(run / 'tiny.cgs').stat().st_size:,} bytes" in shown
+    in_a_new_process(
+        "render", run / "tiny.cgs", "--frames", 3, "--width", 64, "--height", 48, "-o", tmp_path / "orbit"
+    )
+    assert len(list((tmp_path / "orbit").glob("*.png"))) == 3
+    in_a_new_process("render", run / "tiny.cgs", "--cameras", run / "cameras.json", "-o", tmp_path / "views")
+    for image in sorted((tmp_path / "views").glob("*.png")):
+        assert image.read_bytes() == (run / "test" / "renders" / image.name).read_bytes()
+
+
+def test_python_does_the_same_and_the_same_seed_gives_the_same_file(
+    run: Path, scene_folder: Path, tmp_path: Path
+) -> None:
+    from compgs.cli.settings import with_settings
+
+    scene = compgs.load_scene(scene_folder)
+    config = with_settings(compgs.load_config("quick"), [f"training.steps={STEPS}", "training.seed=7"])
+    model = compgs.train(scene, config)
+    compgs.encode(model, tmp_path / "python.cgs")
+    assert (tmp_path / "python.cgs").read_bytes() == (run / "tiny.cgs").read_bytes()
+
+    decoded = compgs.decode(tmp_path / "python.cgs")
+    for view in scene.test_views:
+        before = psnr(to_8bit(compgs.render(model.as_hybrid_model(), view.camera).image), view.image)
+        after = psnr(to_8bit(compgs.render(decoded, view.camera).image), view.image)
+        assert after == pytest.approx(before, abs=0.01)
+
+
+def test_a_run_that_was_stopped_continues_to_the_same_file(
+    run: Path,
+    scene_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    @contextmanager
+    def stopped_half_way() -> Iterator[Callable[[TrainingStatus], None]]:
+        def stop(status: TrainingStatus) -> None:
+            if status.step >= STEPS // 2:
+                raise KeyboardInterrupt
+
+        yield stop
+
+    folder = tmp_path / "stopped"
+    with monkeypatch.context() as patch:
+        patch.setattr(train_command, "training", stopped_half_way)
+        assert main(["train", str(scene_folder), "-o", str(folder), *OPTIONS]) == 130
+    assert f"compgs train -o {folder} --resume" in capsys.readouterr().err
+    assert not (folder / "stopped.cgs").exists()
+    assert main(["encode", str(folder)]) == 1
+    assert "--resume" in capsys.readouterr().err
+    assert main(["train", "-o", str(folder), "--resume"]) == 0
+    assert (folder / "stopped.cgs").read_bytes() == (run / "tiny.cgs").read_bytes()
+
+
+@pytest.mark.parametrize("damage", ["truncated", "altered", "empty", "something else"])
+def test_a_damaged_file_is_refused_by_every_command(
+    run: Path, scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: str
+) -> None:
+    data = (run / "tiny.cgs").read_bytes()
+    middle = len(data) // 2
+    file = tmp_path / "damaged.cgs"
+    file.write_bytes(
+        {
+            "truncated": data[:-100],
+            "altered": data[:middle] + bytes([data[middle] ^ 16]) + data[middle + 1 :],
+            "empty": b"",
+            "something else": b"\x89PNG\r\n\x1a\n" + bytes(1000),
+        }[damage]
+    )
+    commands = [
+        ["info", str(file)],
+        ["decode", str(file), "-o", str(tmp_path / "out")],
+        ["render", str(file), "-o", str(tmp_path / "out")],
+        ["evaluate", str(file), str(scene_folder), "-o", str(tmp_path / "out")],
+    ]
+    for command in commands:
+        assert main(command) == 1
+        err = capsys.readouterr().err
+        assert err.startswith(f"error: {file}: ")
+        assert err.count("\n") == 1
+    assert not (tmp_path / "out").exists()

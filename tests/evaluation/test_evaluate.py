@@ -1,0 +1,148 @@
+"""Evaluation measures what a file decodes to, and writes down exactly that."""
+
+import importlib
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from compgs.cameras import Camera
+from compgs.errors import OutputError, SceneError
+from compgs.evaluation import evaluate as package_evaluate
+from compgs.evaluation.camera_path import read_cameras
+from compgs.evaluation.evaluate import evaluate
+from compgs.scene.views import Points, Scene, View
+
+
+@dataclass(frozen=True)
+class StandIn:
+    """Renders a fixed image whatever the camera."""
+
+    level: float  # 0 to 1
+    anchors: int = 50
+    coupled: int = 400
+
+
+def make_scene(levels: list[int], *, size: tuple[int, int] = (24, 32)) -> Scene:
+    """Flat photographs, all of them held out."""
+    height, width = size
+    views = tuple(
+        View(
+            f"folder/{i}.jpg",
+            Camera(np.eye(4), 30.0, 30.0, width / 2, height / 2, width, height),
+            np.full((height, width, 3), level, np.uint8),
+        )
+        for i, level in enumerate(levels)
+    )
+    points = Points(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8))
+    return Scene("flat", views[:1], views, points, (0.0, 0.0, 0.0), 1.0, Path("flat"))
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that decodes to flat images of level 100."""
+    path = tmp_path / "flat.cgs"
+    path.write_bytes(b"x" * 1000)
+    sections = (SimpleNamespace(name="positions", bytes=300), SimpleNamespace(name="weights", bytes=700))
+    module = importlib.import_module("compgs.evaluation.evaluate")
+
+    def render(model: StandIn, camera: Camera) -> SimpleNamespace:
+        return SimpleNamespace(image=torch.full((camera.height, camera.width, 3), model.level))
+
+    monkeypatch.setattr(module, "decode", lambda path, device: StandIn(100 / 255))
+    monkeypatch.setattr(module, "file_info", lambda data: SimpleNamespace(sections=sections))
+    monkeypatch.setattr(module, "render", render)
+    return path
+
+
+def test_psnr_is_the_mean_over_views_of_a_closed_form(file: Path) -> None:
+    results = evaluate(file, make_scene([101, 110]), device="cpu")
+    psnrs = [20 * math.log10(255 / 1), 20 * math.log10(255 / 10)]
+    assert [view.psnr for view in results.per_view] == pytest.approx(psnrs, abs=1e-6)
+    assert results.psnr == pytest.approx(sum(psnrs) / 2, abs=1e-6)
+    assert 0 < results.ssim <= 1
+
+
+def test_rates_are_of_the_whole_file(file: Path) -> None:
+    results = evaluate(file, make_scene([101]), device="cpu")
+    assert results.bytes == 1000
+    assert results.components == {"positions": 300, "weights": 700}
+    assert results.bits_per_anchor == 8 * 1000 / 50
+    assert results.bits_per_coupled_primitive == 8 * 1000 / 400
+
+
+def test_files_say_what_the_results_say(file: Path, tmp_path: Path) -> None:
+    scene = make_scene([101, 110, 90])
+    output = tmp_path / "report"
+    results = evaluate(file, scene, output=output, device="cpu")
+    assert json.loads((output / "results.json").read_text()) == results.to_dict()
+    rows = json.loads((output / "per_view.json").read_text())
+    assert [row["name"] for row in rows] == [view.name for view in scene.test_views]
+    for row, view in zip(rows, scene.test_views, strict=True):
+        photograph = np.asarray(Image.open(output / "test" / "gt" / row["file"]))
+        rendering = np.asarray(Image.open(output / "test" / "renders" / row["file"]))
+        np.testing.assert_array_equal(photograph, view.image)
+        assert (rendering == 100).all()
+    assert [name for name, _ in read_cameras(output / "cameras.json")] == [
+        view.name for view in scene.test_views
+    ]
+    assert (output / "contact_sheet.png").is_file()
+    assert not list(output.rglob("*.partial"))
+
+
+def test_an_existing_report_is_kept_unless_asked(file: Path, tmp_path: Path) -> None:
+    output = tmp_path / "report"
+    evaluate(file, make_scene([101, 110, 90]), output=output, device="cpu")
+    before = (output / "results.json").read_bytes()
+    with pytest.raises(OutputError, match="overwrite"):
+        evaluate(file, make_scene([50]), output=output, device="cpu")
+    assert (output / "results.json").read_bytes() == before
+    evaluate(file, make_scene([50]), output=output, overwrite=True, device="cpu")
+    assert [path.name for path in (output / "test" / "renders").iterdir()] == ["00000.png"]
+
+
+def test_a_scene_without_held_out_views_is_refused(file: Path) -> None:
+    scene = make_scene([101])
+    everything_trained = Scene(
+        scene.name, scene.test_views, (), scene.points, scene.background, scene.extent, scene.source
+    )
+    with pytest.raises(SceneError, match="held out"):
+        evaluate(file, everything_trained)
+
+
+def test_missing_lpips_is_reported_with_its_reason(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from compgs import metrics
+
+    def unavailable(*_: object) -> float:
+        raise metrics.Unavailable("no weights here")
+
+    monkeypatch.setattr(metrics, "lpips", unavailable)
+    results = evaluate(file, make_scene([101]), lpips=True, device="cpu")
+    assert results.lpips is None
+    assert results.to_dict()["lpips_note"] == "unavailable: no weights here"
+
+
+def test_a_perfect_rendering_is_written_as_valid_json(file: Path, tmp_path: Path) -> None:
+    results = evaluate(file, make_scene([100]), output=tmp_path / "report", device="cpu")
+    assert results.psnr == math.inf
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    written = json.loads((tmp_path / "report" / "results.json").read_text(), parse_constant=refuse)
+    assert written["psnr"] is None
+    assert written["ssim"] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_progress_counts_the_views(file: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    package_evaluate(
+        file, make_scene([1, 2]), device="cpu", progress=lambda done, total: seen.append((done, total))
+    )
+    assert seen == [(1, 2), (2, 2)]
