@@ -1,4 +1,4 @@
-"""The main job on a tiny scene: photographs in, one file out, views rendered from that file by another process."""
+"""The main job on a tiny scene: photographs in, one file out, views rendered from it by another process."""
 
 import json
 import subprocess
