@@ -1,9 +1,10 @@
-"""Writes `src/compgs/codec/gaussian_tables.bin`, the frequency tables of the Gaussian streams (docs/bitstream.md).
+"""Writes `src/compgs/codec/gaussian_tables.bin`: the Gaussian streams' frequency tables (docs/bitstream.md).
 
     python tools/make_gaussian_tables.py [OUTPUT]
 
-The rule, for i = 0 ... 127, in exact arithmetic: sigma = 2^(i/12 - 5) quantization steps, r = ceil(5 sigma) + 1,
-P(q) the mass of a normal distribution with standard deviation sigma in [q - 1/2, q + 1/2], and
+The rule, for i = 0 ... 127, in exact arithmetic: sigma = 2^(i/12 - 5) quantization steps,
+r = ceil(5 sigma) + 1, P(q) the mass of a normal distribution with standard deviation sigma in
+[q - 1/2, q + 1/2], and
 
     f(q)      = max(1, floor(65536 P(q) + 1/2))              for q = 1 ... r, and f(-q) = f(q)
     f(escape) = max(1, floor(65536 P(|x| > r + 1/2) + 1/2))

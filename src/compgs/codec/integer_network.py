@@ -10,6 +10,7 @@ Evaluated in float64: every product and partial sum is an integer below 2^53, so
 any order, on any device, and as fast as the machine's matrix product.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ MAX_SHIFT = 30
 BIAS_LIMIT = 1 << 31  # absolute value of a bias
 ACCUMULATOR_LIMIT = 1 << 52
 SCALE_TABLES = 128
-BLOCK_ROWS = 8192  # rows evaluated at a time: memory, not results, depends on it
+BLOCK_ROWS = 2048  # rows evaluated at a time: memory, not results, depends on it
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class IntegerNetwork:
     def __post_init__(self) -> None:
         if not self.layers:
             raise ValueError("an integer network needs at least one layer")
-        width = self.inputs
+        width = self.layers[0].weight.shape[-1]
         for i, layer in enumerate(self.layers):
             if layer.weight.ndim != 2 or layer.weight.shape[1] != width or 0 in layer.weight.shape:
                 raise ValueError(f"layer {i}: weight has shape {layer.weight.shape}, expected [out, {width}]")
@@ -76,16 +77,11 @@ def evaluate(
 ) -> np.ndarray:  # [N, outputs] int32, Q12
     """The network's outputs, exactly: they do not depend on batch size, order, threads or device."""
     assert x.ndim == 2 and x.shape[1] == network.inputs
-    layers = [(np.ascontiguousarray(layer.weight.T, np.float64), layer) for layer in network.layers]
     out = np.empty((len(x), network.outputs), np.int32)
-    for start in range(0, len(x), BLOCK_ROWS):
-        block = np.clip(x[start : start + BLOCK_ROWS], -ACTIVATION_LIMIT, ACTIVATION_LIMIT - 1).astype(
-            np.float64
-        )
-        for weight, layer in layers:
-            block = block @ weight
-            _finish(block, layer.bias.astype(np.float64), layer.shift, layer.rectify)
-        out[start : start + len(block)] = block
+    last = network.layers[-1]
+    for start, sums in _last_sums(network, x):
+        _finish(sums, last.bias, last.shift, last.rectify)
+        out[start : start + len(sums)] = sums
     return out
 
 
@@ -93,34 +89,61 @@ def entropy_parameters(
     network: IntegerNetwork,
     x: np.ndarray,  # [N, inputs] Q12: what the decoder knows by then
 ) -> tuple[np.ndarray, np.ndarray]:  # [N, C] int32 means Q12, [N, C] uint8 Gaussian tables
-    """Means and scale tables of a stream's C channels (CompGS Sec. 3.3): the network's outputs are [means |
-    scales].
+    """Means and scale tables of a stream's C channels (CompGS Sec. 3.3): the outputs are [means | scales].
 
     table = clamp((scale + 2048) >> 12, 0, 127): a scale output of one is a twelfth of an octave.
     """
+    assert x.ndim == 2 and x.shape[1] == network.inputs
     channels = network.outputs // 2
     means = np.empty((len(x), channels), np.int32)
     index = np.empty((len(x), channels), np.uint8)
-    half = 1 << (FRACTION_BITS - 1)
-    for start in range(0, len(x), BLOCK_ROWS):
-        out = evaluate(network, x[start : start + BLOCK_ROWS])
-        means[start : start + BLOCK_ROWS] = out[:, :channels]
-        scales = (out[:, channels:] + half) >> FRACTION_BITS
-        index[start : start + BLOCK_ROWS] = np.clip(scales, 0, SCALE_TABLES - 1, out=scales)
+    last = network.layers[-1]
+    for start, sums in _last_sums(network, x):
+        block = slice(start, start + len(sums))
+        _finish_parameters(sums, last.bias, last.shift, last.rectify, means[block], index[block])
     return means, index
 
 
+def _last_sums(network: IntegerNetwork, x: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """(first row, W x of the last layer as float64) of one block of rows after the other."""
+    weights = [np.ascontiguousarray(layer.weight.T, np.float64) for layer in network.layers]
+    for start in range(0, len(x), BLOCK_ROWS):
+        block = x[start : start + BLOCK_ROWS]
+        block = np.clip(block, -ACTIVATION_LIMIT, ACTIVATION_LIMIT - 1).astype(np.float64)
+        for weight, layer in zip(weights[:-1], network.layers[:-1], strict=True):
+            block = block @ weight
+            _finish(block, layer.bias, layer.shift, layer.rectify)
+        yield start, block @ weights[-1]
+
+
+@njit(cache=True, inline="always")
+def _activation(a, bias, half, scale, rectify):
+    """Rounding shift, bias, leaky ReLU and clamp of an integer held in a float: floor(a / 2^s) is a >> s."""
+    y = np.floor((a + half) * scale) + bias
+    if rectify:
+        y = max(y, np.floor(y * (1.0 / (1 << SLOPE_BITS))))
+    return min(max(y, -float(ACTIVATION_LIMIT)), float(ACTIVATION_LIMIT - 1))
+
+
 @njit(cache=True, parallel=True)
-def _finish(acc, bias, shift, rectify):
-    """Rounding shift, bias, leaky ReLU and clamp in place; `acc` holds integers, and floor(a / 2^s) is a >>
-    s.
-    """
+def _finish(sums, bias, shift, rectify):
     scale = 1.0 / (1 << shift)
     half = float(1 << (shift - 1)) if shift > 0 else 0.0
-    slope = 1.0 / (1 << SLOPE_BITS)
-    for n in prange(acc.shape[0]):
-        for c in range(acc.shape[1]):
-            y = np.floor((acc[n, c] + half) * scale) + bias[c]
-            if rectify:
-                y = max(y, np.floor(y * slope))
-            acc[n, c] = min(max(y, -float(ACTIVATION_LIMIT)), float(ACTIVATION_LIMIT - 1))
+    for n in prange(sums.shape[0]):
+        for c in range(sums.shape[1]):
+            sums[n, c] = _activation(sums[n, c], float(bias[c]), half, scale, rectify)
+
+
+@njit(cache=True, parallel=True)
+def _finish_parameters(sums, bias, shift, rectify, means, index):
+    scale = 1.0 / (1 << shift)
+    half = float(1 << (shift - 1)) if shift > 0 else 0.0
+    channels = means.shape[1]
+    for n in prange(sums.shape[0]):
+        for c in range(channels):
+            means[n, c] = np.int32(_activation(sums[n, c], float(bias[c]), half, scale, rectify))
+        for c in range(channels):
+            i = channels + c
+            y = np.int32(_activation(sums[n, i], float(bias[i]), half, scale, rectify))
+            table = (y + (1 << (FRACTION_BITS - 1))) >> FRACTION_BITS
+            index[n, c] = min(max(table, 0), SCALE_TABLES - 1)
