@@ -7,14 +7,12 @@ R is made of the bits of the anchors in view, of five streams: reference and res
 hyperpriors, and the covariance parameters. It can be normalized in two ways:
 
 - "elements", as the authors' release: the sum over the streams of their mean bits per element. A bit of a
-small
-  stream weighs more than one of a large stream: twenty times for a hyperprior against the residual
+  small stream weighs more than one of a large stream: twenty times for a hyperprior against the residual
   embeddings.
 - "bits": 5 * all bits / elements of all streams. Every bit weighs the same, as it does in the file. The
-factor 5, the
-  number of streams, makes lambda mean about the same as with "elements": with as many bits per element in
-  every stream, both are equal. With 32 + 6 + 80 + 4 + 10 = 132 elements an anchor, R = 5 bits / (132
-  anchors).
+  factor 5, the number of streams, makes lambda mean about the same as with "elements": with as many bits per
+  element in every stream, both are equal. With 32 + 6 + 80 + 4 + 10 = 132 elements an anchor,
+  R = 5 bits / (132 anchors).
 
 Bits themselves are counted in `entropy`; only this module divides them.
 """

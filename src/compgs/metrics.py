@@ -1,12 +1,10 @@
 """Image quality: PSNR, SSIM, LPIPS. Every number the project reports follows these conventions.
 
 - Images are uint8 [H, W, 3], display RGB: a rendering is *rounded* to 8 bits (`to_8bit`), as a file would be,
-not
-  truncated and not left in floating point.
-- PSNR: of the mean squared error over pixels and channels, data range 255; identical images give infinity. -
-SSIM: 11 x 11 Gaussian window, sigma 1.5, zeros outside the image, data range 1, C1 = 0.01^2, C2 = 0.03^2,
-mean over
-  pixels and channels: the one of 3DGS (`compgs.ssim`).
+  not truncated and not left in floating point.
+- PSNR: of the mean squared error over pixels and channels, data range 255; identical images give infinity.
+- SSIM: 11 x 11 Gaussian window, sigma 1.5, zeros outside the image, data range 1, C1 = 0.01^2, C2 = 0.03^2,
+  mean over pixels and channels: the one of 3DGS (`compgs.ssim`).
 - LPIPS: network "vgg" as in 3DGS unless "alex" is asked for, version 0.1 through torchmetrics, inputs in
   [-1, 1]. The releases of 3DGS and CompGS feed [0, 1]: their figures are not comparable.
 
@@ -78,7 +76,7 @@ def lpips(a: np.ndarray, b: np.ndarray, network: LpipsNetwork | Literal["vgg", "
 
 @functools.cache
 def lpips_network(name: Literal["vgg", "alex"]) -> LpipsNetwork:
-    """The network with its published weights: torchmetrics, and a backbone in torch's folder of checkpoints."""
+    """The network with its published weights: torchmetrics, and a backbone in torch's checkpoint folder."""
     try:
         import torchvision
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity

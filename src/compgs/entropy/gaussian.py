@@ -4,8 +4,8 @@ A symbol with value `x` relative to its mean, in quantization steps, has the pro
 
     p = Phi(u) - Phi(l),    u = (|x| + 1/2) / sigma,    l = (|x| - 1/2) / sigma
 
-Scales travel as a *scale index* s, the number of the codec's integer table: sigma = 2^(s/12 - 5) steps, 0 <=
-s <= 127. The networks predict s itself, so that the decoder needs neither exp nor softplus.
+Scales travel as a *scale index* s, the number of the codec's integer table: sigma = 2^(s/12 - 5) steps,
+0 <= s <= 127. The networks predict s itself, so that the decoder needs neither exp nor softplus.
 
 There is no floor under the likelihood: far from the mean it is evaluated as exp(-l^2 / 2) D, whose logarithm
 and gradient are good at any distance. With the scaled tail E(t) = exp(t^2 / 2) (1 - Phi(t)),
@@ -110,7 +110,7 @@ _SQRT2 = _f(math.sqrt(2.0))
 @njit(inline="always")
 def _exp2(t):
     """2^t for -100 <= t <= 126 (1e-7 relative); smaller t count as -100, as denormal numbers are slow."""
-    t = t if t > _f(-100.0) else _f(-100.0)
+    t = _f(-100.0) if t < _f(-100.0) else t
     k = np.floor(t + _HALF)
     f = t - k
     p = _f(1.53458074e-4)
@@ -138,7 +138,8 @@ def _log2(x):
     q = q * m + _f(0.2000228579)
     q = q * m + _f(-0.2500080903)
     q = q * m + _f(0.3333331673)
-    return _f(k) + _LOG2_E_F * (m + m * m * (m * q - _HALF))
+    # x - x: the bits of not a number look like those of a number.
+    return _f(k) + _LOG2_E_F * (m + m * m * (m * q - _HALF)) + (x - x)
 
 
 @njit(inline="always")
@@ -161,8 +162,9 @@ def _tail(t):
 @njit(inline="always")
 def _interval(x, s):
     """(1/sigma, l, u, exp of l's part, exp of u's part, D) as in the module's docstring."""
-    s = s if s > _ZERO else _ZERO
-    s = s if s < _TOP_F else _TOP_F
+    # In this order, not a number stays one.
+    s = _ZERO if s < _ZERO else s
+    s = _TOP_F if s > _TOP_F else s
     inverse = _exp2(-_MIN_LOG2 - s * _OCTAVES)
     a = abs(x)
     l = (a - _HALF) * inverse
@@ -180,7 +182,7 @@ def _element_bits(x, s, bits):
     """All flat, same length. Kept apart from the parallel loop so that LLVM vectorizes it."""
     for i in range(np.uint64(x.size)):
         _, l, _, _, _, d = _interval(x[i], s[i])
-        l = l if l > _ZERO else _ZERO
+        l = _ZERO if l < _ZERO else l
         bits[i] = _HALF_LOG2_E * l * l - _log2(d)
 
 
