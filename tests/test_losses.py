@@ -1,8 +1,11 @@
+import re
+
 import numba
 import numpy as np
 import pytest
 import torch
 
+from compgs import ssim as ssim_module
 from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer
 from compgs.ssim import l1_and_ssim, ssim, window
 
@@ -80,6 +83,13 @@ def test_a_target_holds_the_photograph_itself_and_no_copy():
     assert target.image[1, 2, 0] == 7
 
 
+def test_a_target_can_be_made_from_a_read_only_image():
+    _, photograph = pair(6, 7)
+    image = photograph.numpy()
+    image.setflags(write=False)
+    assert torch.equal(Target.from_image(image).image, photograph)
+
+
 def test_a_perfect_rendering_costs_nothing_and_has_no_gradient():
     _, photograph = pair(30, 40)
     x = (photograph.float() / 255).requires_grad_()
@@ -101,6 +111,26 @@ def test_gradients_are_the_same_bits_with_one_thread_and_with_several():
     for other in results[1:]:
         assert results[0][:2] == other[:2]
         np.testing.assert_array_equal(results[0][2], other[2])
+
+
+ROW, BYTES, SCRATCH = np.ones(8, np.float32), np.ones(8, np.uint8), np.ones(ssim_module._SCRATCH, np.float32)
+F = np.float32(0.5)
+KERNELS = {
+    "_add_products": (SCRATCH, 0, ROW, BYTES, F, F),
+    "_similarity": (SCRATCH, 8),
+    "_add_maps": (SCRATCH, 0, ROW, ROW, ROW, F),
+    "_combine": (SCRATCH, ROW, BYTES, F, F, F, ROW),
+}
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_the_kernels_are_compiled_to_vector_instructions(name):
+    """Losing them is silent otherwise, and costs a factor of five."""
+    kernel = getattr(ssim_module, name)
+    fresh = numba.njit(kernel.py_func, **{k: v for k, v in kernel.targetoptions.items() if k != "nopython"})
+    fresh(*KERNELS[name])
+    (code,) = fresh.inspect_llvm().values()
+    assert re.search(r"fmul [a-z ]*<(4|8|16) x float>", code)
 
 
 def test_a_rendering_laid_out_otherwise_is_taken():

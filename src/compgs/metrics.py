@@ -59,7 +59,8 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     """Structural similarity of uint8 images [H, W, 3]; 1 for identical images."""
     _check(a, b)
     x = a.astype(np.float32) / np.float32(255.0)
-    return l1_and_ssim(np.ascontiguousarray(x), np.ascontiguousarray(b))[1]
+    # Writable, as in training: read-only arrays would be compiled for anew.
+    return l1_and_ssim(np.ascontiguousarray(x), np.require(b, requirements="CW"))[1]
 
 
 def lpips(a: np.ndarray, b: np.ndarray, network: LpipsNetwork | Literal["vgg", "alex"] = "vgg") -> float:
