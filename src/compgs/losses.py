@@ -41,7 +41,7 @@ class Target:
     @staticmethod
     def from_image(image: np.ndarray, device: torch.device | str = "cpu") -> "Target":
         """From uint8 [H, W, 3]; on the CPU it shares the array's memory where it can."""
-        return Target(torch.from_numpy(np.require(image, requirements="CW")).to(device))
+        return Target(torch.from_numpy(np.require(image, requirements=("C", "W"))).to(device))
 
 
 def photometric_loss(

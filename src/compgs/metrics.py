@@ -60,7 +60,7 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     _check(a, b)
     x = a.astype(np.float32) / np.float32(255.0)
     # Writable, as in training: read-only arrays would be compiled for anew.
-    return l1_and_ssim(np.ascontiguousarray(x), np.require(b, requirements="CW"))[1]
+    return l1_and_ssim(np.ascontiguousarray(x), np.require(b, requirements=("C", "W")))[1]
 
 
 def lpips(a: np.ndarray, b: np.ndarray, network: LpipsNetwork | Literal["vgg", "alex"] = "vgg") -> float:
