@@ -1,0 +1,315 @@
+"""Rate-distortion optimization of one scene (CompGS Sec. 3.4): a loop short enough to read aloud."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from compgs.cameras import Camera
+from compgs.config import Config, check_config, load_config
+from compgs.errors import CheckpointError, ConfigError, TrainingError
+from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer
+from compgs.model.prediction import OPACITY_CUTOFF, Prediction, predict
+from compgs.render import RasterSettings, rasterize, visible_mask
+from compgs.scene.points import median_spacing, voxel_grid
+from compgs.scene.views import Scene, View
+from compgs.trained_model import TrainedModel
+from compgs.training.checkpoint import (
+    CHECKPOINT_NAME,
+    Checkpoint,
+    load_checkpoint,
+    optimizer_tensors,
+    restore_optimizer,
+    save_checkpoint,
+)
+from compgs.training.control import AdaptiveControl, make_schedule
+from compgs.training.optimizers import make_optimizer, set_learning_rates
+
+REPORT_EVERY = 10  # steps between two status reports
+ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it looks at every anchor
+POSITION_BITS = 15.0  # bits per anchor position, for the estimate only
+
+
+@dataclass(frozen=True)
+class TrainingStatus:
+    """What a progress display shows."""
+
+    step: int
+    steps: int
+    loss: float
+    psnr: float  # dB, of the last training view
+    anchors: int
+    estimated_bytes: int
+    seconds_per_step: float
+
+
+@dataclass(frozen=True)
+class StepResult:
+    loss: float
+    image: Tensor  # [H, W, 3]
+    view: View
+
+
+def train(
+    scene: Scene,
+    config: Config | None = None,
+    *,
+    preset: str = "default",
+    output: str | Path | None = None,
+    resume: bool = False,
+    on_progress: Callable[[TrainingStatus], None] | None = None,
+    device: str | torch.device | None = None,
+) -> TrainedModel:
+    """Train a scene; the result is ready for `compgs.encode`.
+
+    With `output`, a folder, checkpoints are written there, also when the run is interrupted; `resume` continues from
+    the last one exactly as if the run had not stopped. Default device: CUDA where there is one.
+
+    Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
+    """
+    config = config or load_config(preset)
+    check_config(config)
+    chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    path = Path(output) / CHECKPOINT_NAME if output is not None else None
+    if resume:
+        if path is None:
+            raise ConfigError("resume needs an output folder: the one of the run to continue")
+        trainer = Trainer.resumed(scene, load_checkpoint(path), config, chosen)
+    else:
+        trainer = Trainer(scene, config, chosen)
+    trainer.run(path, on_progress)
+    return trainer.model
+
+
+class Trainer:
+    """State of a run: model, optimizer, adaptive control, and the order in which views come."""
+
+    def __init__(
+        self, scene: Scene, config: Config, device: torch.device, model: TrainedModel | None = None
+    ) -> None:
+        if not scene.train_views:
+            raise ConfigError(f"{scene.name}: no training views are left after holding out the test views")
+        self.scene = scene
+        self.config = config
+        self.device = device
+        self.model = (model or initial_model(scene, config)).to(device)
+        self.optimizer = make_optimizer(self.model, config.training)
+        self.schedule = make_schedule(config.control, config.training.steps, len(scene.train_views))
+        self.control = AdaptiveControl(config, self.schedule, self.model.anchors, device)
+        self.noise = torch.Generator(device).manual_seed(config.training.seed + 1)
+        self.shuffle = np.random.default_rng(config.training.seed + 2)
+        self.order: list[int] = []
+        self.targets: dict[int, Target] = {}
+        self.settings = RasterSettings(background=scene.background)
+        self.step = 0
+
+    # one step ------------------------------------------------------------------------------------------------------
+
+    def train_step(self) -> StepResult:
+        """Quantize, predict, rasterize, compare, pull (the paper's Fig. 2 from left to right)."""
+        t, progress = self.config.training, self.step / self.config.training.steps
+        view_index = self.next_view()
+        view = self.scene.train_views[view_index]
+        stored = progress >= t.quantized_weights
+
+        rows = self.visible_anchors(view.camera)
+        if len(rows) == 0:
+            raise TrainingError(f"step {self.step}: no anchor is visible in {view.name}; are the poses right?")
+        latents = self.model.quantized(
+            rows, rate=progress >= t.rate_start, noise=self.noise, stored_weights=stored
+        )
+        prediction = self.predict(latents, rows, view.camera, stored)
+        rendered = rasterize(prediction.gaussians, view.camera, self.settings)
+        if self.schedule.active(self.step):
+            rendered.means2d.retain_grad()
+        distortion = photometric_loss(rendered.image, self.target(view_index), t.ssim_weight)
+        loss = distortion + t.scale_weight * scale_regularizer(prediction.gaussians.scales)
+        if latents.bits:
+            elements = self.elements(len(rows))
+            loss = rate_distortion_loss(loss, rate(latents.bits, elements, t.rate), t.lmbda)
+        loss.backward()
+
+        set_learning_rates(self.optimizer, progress)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        if self.schedule.active(self.step):
+            gradient = rendered.means2d.grad
+            if gradient is not None:
+                self.control.observe(rows, prediction, gradient, view.camera)
+            if self.schedule.due(self.step):
+                self.control.act(self.model, self.optimizer, self.coupled_means(), self.noise)
+        self.step += 1
+        return StepResult(float(loss.detach()), rendered.image.detach(), view)
+
+    def next_view(self) -> int:
+        """Every view once in random order, then again."""
+        if not self.order:
+            self.order = [int(i) for i in self.shuffle.permutation(len(self.scene.train_views))]
+        return self.order.pop()
+
+    def target(self, view_index: int) -> Target:
+        if view_index not in self.targets:
+            self.targets[view_index] = Target.from_image(self.scene.train_views[view_index].image, self.device)
+        return self.targets[view_index]
+
+    @torch.no_grad()
+    def visible_anchors(self, camera: Camera) -> Tensor:
+        """[V] int64: anchors whose primitives may be in the image."""
+        model = self.model
+        # The reach of an anchor: offsets of a few units, primitives of at most three of their sizes.
+        sizes = model.log_scales.exp() * model.voxel_size
+        radii = 2.0 * sizes[:, :3].amax(1) + 3.0 * sizes[:, 3:].amax(1)
+        return torch.nonzero(visible_mask(model.positions(), radii, camera, self.settings)).view(-1)
+
+    def predict(self, latents, rows: Tensor, camera: Camera, stored: bool) -> Prediction:  # type: ignore[no-untyped-def]
+        center = torch.as_tensor(camera.center, dtype=torch.float32, device=self.device)
+        weights = self.model.stored_head_weights() if stored else None
+        primitives = self.model.primitives(latents, rows)
+        return predict(self.model.heads, primitives, center, self.model.distance_unit, weights)
+
+    def elements(self, anchors: int) -> dict[str, int]:
+        """Number of coded symbols of each stream for so many anchors."""
+        m, e = self.config.model, self.config.entropy
+        channels = {
+            "reference_hyper": e.reference_hyper_dim,
+            "reference": m.reference_dim,
+            "covariance": 6,
+            "residual_hyper": e.residual_hyper_dim,
+            "residual": m.coupled_primitives * m.residual_dim,
+        }
+        return {name: anchors * n for name, n in channels.items()}
+
+    @torch.no_grad()
+    def coupled_means(self) -> Tensor:
+        """[N, K, 3] world units: where the coupled primitives are now."""
+        model, k = self.model, self.config.model.coupled_primitives
+        parts = []
+        for rows in torch.arange(model.anchors, device=self.device).split(20_000):
+            p = model.primitives(model.quantized(rows, stored_weights=False), rows)
+            raw = model.heads("geometry", p.references, p.residuals, p.anchor_index)
+            means = p.positions[p.anchor_index] + raw[:, :3] * p.offset_scales[p.anchor_index]
+            parts.append(means.view(-1, k, 3))
+        return torch.cat(parts)
+
+    # the run -------------------------------------------------------------------------------------------------------
+
+    def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
+        """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
+        t = self.config.training
+        saved = started = time.perf_counter()
+        first, estimate = self.step, 0
+        try:
+            while self.step < t.steps:
+                result = self.train_step()
+                now = time.perf_counter()
+                if on_progress and (self.step % REPORT_EVERY == 0 or self.step == t.steps):
+                    if self.step % ESTIMATE_EVERY == 0 or not estimate:
+                        estimate = self.estimated_bytes()
+                    pace = (now - started) / (self.step - first)
+                    on_progress(self.status(result, estimate, pace))
+                if self.step % REPORT_EVERY == 0 and not np.isfinite(result.loss):
+                    raise TrainingError(
+                        f"step {self.step}: the loss is {result.loss}; try a lower learning rate or another seed"
+                    )
+                if path and now - saved > 60 * t.checkpoint_minutes:
+                    self.save(path)
+                    saved = now
+            self.finish()
+        except KeyboardInterrupt:
+            if path:
+                self.save(path)
+            raise
+        if path:
+            self.save(path)
+
+    def status(self, result: StepResult, estimate: int, pace: float) -> TrainingStatus:
+        photograph = torch.as_tensor(result.view.image, device=result.image.device).float() / 255.0
+        error = float(((result.image.clamp(0, 1) - photograph) ** 2).mean())
+        psnr = -10.0 * float(np.log10(max(error, 1e-10)))
+        return TrainingStatus(
+            self.step, self.config.training.steps, result.loss, psnr, self.model.anchors, estimate, pace
+        )
+
+    def estimated_bytes(self) -> int:
+        """Of the file, were it written now."""
+        e, model = self.config.entropy, self.model
+        bits = sum(model.estimated_bits().values()) + POSITION_BITS * model.anchors
+        bits += e.head_bits * sum(p.numel() for p in model.heads.parameters())
+        for network in ("reference_network", "covariance_network", "residual_network"):
+            bits += e.network_bits * sum(p.numel() for p in getattr(model.entropy, network).parameters())
+        return int(bits / 8)
+
+    @torch.no_grad()
+    def finish(self) -> None:
+        """Drop coupled primitives that no training view ever sees, and anchors that have none left."""
+        model, k = self.model, self.config.model.coupled_primitives
+        opacity = torch.zeros(model.anchors, k, device=self.device)
+        for view in self.scene.train_views:
+            rows = self.visible_anchors(view.camera)
+            latents = model.quantized(rows)
+            seen = self.predict(latents, rows, view.camera, stored=True).opacities.view(-1, k)
+            opacity[rows] = torch.maximum(opacity[rows], seen)
+        model.mask = opacity > OPACITY_CUTOFF
+        if not model.mask.any():
+            raise TrainingError("no primitive is visible in any training view; the run has failed")
+
+    # checkpoints ---------------------------------------------------------------------------------------------------
+
+    def save(self, path: Path) -> None:
+        extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
+        extra["noise"] = self.noise.get_state()
+        state = {
+            "step": self.step,
+            "order": self.order,
+            "shuffle": self.shuffle.bit_generator.state,
+            "views": [view.name for view in self.scene.train_views],
+        }
+        save_checkpoint(path, Checkpoint(self.model, optimizer_tensors(self.model, self.optimizer), extra, state))
+
+    @classmethod
+    def resumed(cls, scene: Scene, checkpoint: Checkpoint, config: Config, device: torch.device) -> "Trainer":
+        """Raises CheckpointError if the run was another scene's or had other settings."""
+        saved = checkpoint.model.config
+        if saved != config:
+            differing = [
+                f"{section}.{key}: {value!r} then, {config.to_dict()[section][key]!r} now"
+                for section, values in saved.to_dict().items()
+                for key, value in values.items()
+                if config.to_dict()[section][key] != value
+            ]
+            raise CheckpointError(f"the run to continue had other settings ({'; '.join(differing)})")
+        if checkpoint.state["views"] != [view.name for view in scene.train_views]:
+            raise CheckpointError("the run to continue was trained on other views; give the same scene")
+        trainer = cls(scene, config, device, checkpoint.model)
+        restore_optimizer(trainer.model, trainer.optimizer, checkpoint.optimizer)
+        for name in AdaptiveControl.STATISTICS:
+            setattr(trainer.control, name, checkpoint.extra[f"control/{name}"].to(device))
+        trainer.noise.set_state(checkpoint.extra["noise"])
+        trainer.shuffle.bit_generator.state = checkpoint.state["shuffle"]
+        trainer.order = checkpoint.state["order"]
+        trainer.step = checkpoint.state["step"]
+        return trainer
+
+
+def initial_model(scene: Scene, config: Config) -> TrainedModel:
+    """Anchors on the voxel grid of the scene's points, as large as the distance to their neighbours."""
+    m = config.model
+    wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
+    coordinates, voxel_size = voxel_grid(scene.points, wanted)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.training.seed)
+        model = TrainedModel(
+            config, torch.from_numpy(coordinates), voxel_size, scene.extent, tuple(scene.background)
+        )
+    neighbours = min(4, len(coordinates))
+    distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(len(coordinates), neighbours)
+    spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(1)
+    with torch.no_grad():
+        model.log_scales.copy_(torch.from_numpy(np.log(np.maximum(spread, 0.1))).float()[:, None].expand(-1, 6))
+        model.entropy.fit_covariance_prior(model.log_scales)
+    return model

@@ -1,0 +1,73 @@
+import pytest
+import torch
+
+from compgs.config import EntropyConfig, ModelConfig
+from compgs.entropy import STREAMS, EntropyModel
+
+MODEL = ModelConfig(coupled_primitives=3, reference_dim=6, residual_dim=4)
+ENTROPY = EntropyConfig(reference_hyper_dim=2, residual_hyper_dim=3)
+
+
+def latents(n=50, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return [torch.randn(n, c, generator=g) * s for c, s in ((6, 3.0), (6, 20.0), (12, 2.0))]
+
+
+@pytest.fixture
+def entropy():
+    torch.manual_seed(0)
+    return EntropyModel(MODEL, ENTROPY)
+
+
+def test_bits_are_given_per_anchor_for_every_stream(entropy):
+    result = entropy(*latents(), rate=True)
+    assert tuple(result.bits) == STREAMS
+    assert all(b.shape == (50,) and (b > 0).all() for b in result.bits.values())
+
+
+def test_without_rate_nothing_is_estimated_and_latents_are_the_same(entropy):
+    with_rate, without = entropy(*latents(), rate=True), entropy(*latents(), rate=False)
+    assert without.bits == {}
+    assert torch.equal(with_rate.residuals, without.residuals)
+
+
+def test_an_anchor_is_coded_independently_of_the_others(entropy):
+    whole = entropy(*latents(), rate=True)
+    part = entropy(*[x[10:20] for x in latents()], rate=True)
+    torch.testing.assert_close(part.references, whole.references[10:20])
+    torch.testing.assert_close(part.bits["residual"], whole.bits["residual"][10:20])
+
+
+def test_quantization_moves_no_latent_by_more_than_half_a_step(entropy):
+    f, c, g = latents()
+    result = entropy(f, c, g, rate=False, network_bits=10)
+    for before, after in ((f, result.references), (c, result.covariances), (g, result.residuals)):
+        assert (before - after).abs().max() <= 0.5 + 1e-4
+
+
+def test_the_prior_of_the_covariance_starts_at_the_data(entropy):
+    log_scales = torch.randn(500, 6) * 0.7 - 1.3
+    y = log_scales / entropy.covariance_step
+    before = entropy(torch.zeros(500, 6), y, torch.zeros(500, 12), rate=True).bits["covariance"].mean()
+    entropy.fit_covariance_prior(log_scales)
+    after = entropy(torch.zeros(500, 6), y, torch.zeros(500, 12), rate=True).bits["covariance"].mean()
+    # 6 Gaussians of 0.7 natural units in steps of 0.05: log2(14 sqrt(2 pi e)) = 5.85 bits each.
+    assert after < before
+    assert float(after) == pytest.approx(6 * 5.85, rel=0.05)
+
+
+def test_minimizing_the_bits_lets_the_networks_find_a_dependence(entropy):
+    """Covariances that are a function of the references end up nearly free."""
+    g = torch.Generator().manual_seed(2)
+    f = (torch.randn(400, 6, generator=g) * 4).round()
+    c = f @ torch.randn(6, 6, generator=g)
+    optimizer = torch.optim.Adam(entropy.parameters(), 0.02)
+    first = last = 0.0
+    for _ in range(300):
+        bits = entropy(f, c, torch.zeros(400, 12), rate=True, noise=g).bits["covariance"].mean()
+        first = first or float(bits)
+        last = float(bits)
+        optimizer.zero_grad()
+        bits.backward()
+        optimizer.step()
+    assert last < 0.5 * first

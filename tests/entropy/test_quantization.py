@@ -1,0 +1,39 @@
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from compgs.entropy.quantization import quantize, quantize_weight, uniform_noise, weight_exponent
+
+
+def test_quantized_latents_differ_from_the_mean_by_whole_steps():
+    y, mean = torch.randn(100, 7) * 5, torch.randn(100, 7)
+    symbols = quantize(y, mean) - mean
+    torch.testing.assert_close(symbols, symbols.round(), atol=1e-5, rtol=0)
+    assert (quantize(y, mean) - y).abs().max() <= 0.5 + 1e-5
+
+
+def test_the_gradient_reaches_the_latent_unchanged_and_never_the_mean():
+    y, mean = torch.randn(5, 3, requires_grad=True), torch.randn(5, 3, requires_grad=True)
+    upstream = torch.randn(5, 3)
+    (quantize(y, mean) * upstream).sum().backward()
+    assert torch.equal(y.grad, upstream)
+    assert mean.grad is None
+
+
+@given(st.integers(6, 16), st.floats(1e-4, 30.0), st.integers(0, 1000))
+def test_stored_weights_are_integers_of_that_many_bits(bits, spread, seed):
+    weight = torch.randn(13, 5, generator=torch.Generator().manual_seed(seed)) * spread
+    exponent = weight_exponent(weight, bits)
+    integers = quantize_weight(weight, bits).double() * 2.0**exponent
+    assert torch.equal(integers, integers.round())
+    assert integers.abs().max() <= (1 << (bits - 1)) - 1
+    if 0 < exponent < 24:
+        assert float(weight.abs().max()) * 2.0 ** (exponent + 1) > (1 << (bits - 1)) - 2
+
+
+def test_noise_is_uniform_over_one_step_and_repeats_with_its_generator():
+    like = torch.empty(10_000)
+    noise = uniform_noise(like, torch.Generator().manual_seed(1))
+    assert noise.min() >= -0.5 and noise.max() <= 0.5
+    assert abs(float(noise.mean())) < 0.02 and abs(float(noise.var()) - 1 / 12) < 0.003
+    assert torch.equal(noise, uniform_noise(like, torch.Generator().manual_seed(1)))

@@ -1,0 +1,68 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from compgs.errors import ConfigError
+from compgs.training import train
+from compgs.training.trainer import Trainer
+
+CPU = torch.device("cpu")
+
+
+def test_the_same_seed_gives_the_same_model_and_another_seed_another(blob_scene, tiny_config):
+    short = replace(tiny_config, training=replace(tiny_config.training, steps=12))
+    first, second = train(blob_scene, short), train(blob_scene, short)
+    for name, value in first.state_dict().items():
+        assert torch.equal(value, second.state_dict()[name]), name
+    other = train(blob_scene, replace(short, training=replace(short.training, seed=4)))
+    assert not torch.equal(first.references, other.references[: len(first.references)])
+
+
+def test_training_lowers_the_loss(blob_scene, tiny_config):
+    longer = replace(tiny_config, training=replace(tiny_config.training, steps=120))
+    trainer = Trainer(blob_scene, longer, CPU)
+    losses = [trainer.train_step().loss for _ in range(120)]
+    assert sum(losses[-10:]) < 0.6 * sum(losses[:10])
+
+
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("normalization", ["bits", "elements"])
+def test_every_layout_and_rate_trains_all_parameters(blob_scene, tiny_config, layout, normalization):
+    config = replace(
+        tiny_config,
+        model=replace(tiny_config.model, heads=layout),
+        training=replace(tiny_config.training, steps=20, rate=normalization),
+    )
+    trainer = Trainer(blob_scene, config, CPU)
+    before = {name: p.detach().clone() for name, p in trainer.model.named_parameters()}
+    for _ in range(6):
+        trainer.train_step()
+    still = [
+        name
+        for name, p in trainer.model.named_parameters()
+        if p.shape == before[name].shape and torch.equal(p, before[name])
+    ]
+    assert still == []
+
+
+def test_a_higher_lambda_spends_fewer_bits(blob_scene, tiny_config):
+    bits = []
+    for lmbda in (0.0, 0.02):
+        config = replace(tiny_config, training=replace(tiny_config.training, steps=120, lmbda=lmbda))
+        bits.append(sum(train(blob_scene, config).estimated_bits().values()))
+    assert bits[1] < 0.8 * bits[0]
+
+
+def test_primitives_that_no_view_sees_are_dropped_at_the_end(blob_scene, tiny_config):
+    trainer = Trainer(blob_scene, tiny_config, CPU)
+    trainer.run(None, None)
+    mask = trainer.model.mask
+    assert mask.any() and mask.shape == (trainer.model.anchors, 4)
+    hybrid = trainer.model.as_hybrid_model()
+    assert hybrid.coupled == int(mask.sum())
+
+
+def test_no_training_views_is_a_settings_error(blob_scene, tiny_config):
+    with pytest.raises(ConfigError, match="no training views"):
+        train(replace(blob_scene, train_views=()), tiny_config)
