@@ -1,0 +1,115 @@
+"""Rasterization on CUDA through gsplat (Apache-2.0), an optional extra.
+
+gsplat's parts are composed here instead of calling its `rasterization`, so that `means2d` is one [M, 2]
+tensor that lies on the path from parameters to image: densification reads its gradient. Written against
+gsplat 1.5.
+"""
+
+import functools
+from dataclasses import replace
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from compgs.cameras import Camera
+from compgs.errors import ConfigError, MissingDependency
+from compgs.gaussians import Gaussians
+from compgs.render.result import RasterResult
+from compgs.render.settings import DEFAULT_SETTINGS, RasterSettings
+
+TILE_SIZE = 16  # pixels
+
+
+def rasterize_gsplat(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> RasterResult:
+    """float32 tensors on CUDA. `visible` is gsplat's box test, which rounds boxes up to whole pixels."""
+    check_settings(settings)
+    gsplat = load_gsplat()
+    means, opacities = gaussians.means, gaussians.opacities
+    background = background_on(settings.background, means.device)
+    if len(gaussians) == 0:
+        image = background.expand(camera.height, camera.width, 3)
+        return RasterResult(image, image.new_ones(image.shape[:2]), means[:, :2], opacities > 0)
+
+    view, intrinsics = camera_on(camera, means.device)
+    radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
+        means.contiguous(),
+        None,
+        gaussians.quaternions.contiguous(),
+        gaussians.scales.contiguous(),
+        view,
+        intrinsics,
+        camera.width,
+        camera.height,
+        eps2d=settings.dilation,
+        near_plane=settings.near_plane,
+        packed=False,
+        opacities=opacities.contiguous(),
+    )
+    visible = (radii[0] > 0).all(-1)
+    # Rows of Gaussians that are not drawn are not initialized by gsplat.
+    means2d = torch.where(visible[:, None], means2d[0], means2d.new_zeros(()))
+    columns, rows = -(-camera.width // TILE_SIZE), -(-camera.height // TILE_SIZE)
+    with torch.no_grad():
+        _, tiles, splats = gsplat.isect_tiles(
+            means2d[None], radii, depths, TILE_SIZE, columns, rows, packed=False
+        )
+        offsets = gsplat.isect_offset_encode(tiles, 1, columns, rows)
+    image, alphas = gsplat.rasterize_to_pixels(
+        means2d[None],
+        conics,
+        gaussians.colors[None].contiguous(),
+        opacities[None].contiguous(),
+        camera.width,
+        camera.height,
+        TILE_SIZE,
+        offsets.reshape(1, rows, columns),
+        splats,
+        backgrounds=background[None],
+        packed=False,
+    )
+    return RasterResult(image[0], 1 - alphas[0, ..., 0], means2d, visible)
+
+
+def check_settings(settings: RasterSettings) -> None:
+    """Raises ConfigError for a setting that gsplat's kernels hold as a compiled constant."""
+    free = {"background", "near_plane", "dilation"}
+    fixed = replace(DEFAULT_SETTINGS, **{name: getattr(settings, name) for name in free})
+    if settings != fixed:
+        raise ConfigError(
+            f"{settings}: on CUDA only {', '.join(sorted(free))} can differ from the defaults; "
+            "move the Gaussians to the CPU"
+        )
+
+
+def load_gsplat() -> ModuleType:
+    """The gsplat package. Raises MissingDependency where it cannot work."""
+    # Asked first: without a device, importing gsplat next to an nvcc starts to compile its kernels.
+    if not torch.cuda.is_available():
+        raise MissingDependency(
+            "rendering on CUDA: no CUDA device is available; move the Gaussians to the CPU"
+        )
+    try:
+        import gsplat
+    except ImportError as error:
+        raise MissingDependency(
+            f"rendering on CUDA needs gsplat ({error}); install it with: pip install 'compgs[cuda]'"
+        ) from error
+    return gsplat
+
+
+# Small tensors that would otherwise be copied to the device, and waited for, at every view.
+@functools.lru_cache(maxsize=4096)
+def camera_on(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
+    """World to camera [1, 4, 4] and intrinsics [1, 3, 3] on a device."""
+    intrinsics = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    return (
+        torch.tensor(camera.world_to_camera, dtype=torch.float32, device=device)[None],
+        torch.tensor(intrinsics, dtype=torch.float32, device=device)[None],
+    )
+
+
+@functools.lru_cache(maxsize=16)
+def background_on(background: tuple[float, float, float], device: torch.device) -> Tensor:
+    """[3] RGB on a device."""
+    return torch.tensor(background, dtype=torch.float32, device=device)

@@ -1,0 +1,126 @@
+"""Rasterization on the CPU: projection, binning and blending behind autograd.
+
+means, quaternions, scales ──Project──► means2d, covariances ─┐
+opacities, colors ────────────────────────────────────────────┴──Blend──► image, transmittance
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from compgs.cameras import Camera
+from compgs.gaussians import Gaussians
+from compgs.render.binning import TileLists, bin_splats
+from compgs.render.projection import Project, as_array, camera_numbers
+from compgs.render.result import RasterResult
+from compgs.render.settings import RasterSettings
+from compgs.render.tiles import MOMENTS, blend_backward, blend_forward, sum_moments
+
+
+def rasterize_numba(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> RasterResult:
+    """float32 tensors on the CPU."""
+    means2d, covariances, depths, determinants = Project.apply(
+        gaussians.means, gaussians.quaternions, gaussians.scales, camera_numbers(camera, settings)
+    )
+    image, transmittance, visible = Blend.apply(
+        means2d, covariances, gaussians.opacities, gaussians.colors, depths, determinants, camera, settings
+    )
+    return RasterResult(image, transmittance, means2d, visible)
+
+
+class Blend(torch.autograd.Function):
+    """image [H, W, 3], transmittance [H, W]; without gradient: visible [M]."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means2d: Tensor,
+        covariances: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        depths: Tensor,
+        determinants: Tensor,
+        camera: Camera,
+        settings: RasterSettings,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        lists, visible = bin_splats(
+            means2d=as_array(means2d),
+            covariances=as_array(covariances),
+            determinants=as_array(determinants),
+            depths=as_array(depths),
+            opacities=as_array(opacities),
+            colors=as_array(colors),
+            width=camera.width,
+            height=camera.height,
+            settings=settings,
+        )
+        image = means2d.new_empty(camera.height, camera.width, 3)
+        transmittance = means2d.new_empty(camera.height, camera.width)
+        ends = np.empty(len(lists.starts) - 1, np.int64)
+        cutoff, cap, stop = thresholds = blend_thresholds(settings)
+        blend_forward(
+            lists.packed,
+            lists.starts,
+            lists.entries,
+            np.array(settings.background, np.float32),
+            cutoff,
+            cap,
+            stop,
+            as_array(image),
+            as_array(transmittance),
+            ends,
+        )
+        ctx.lists, ctx.ends, ctx.thresholds = lists, ends, thresholds
+        ctx.save_for_backward(image, transmittance, opacities)
+        visible_mask = torch.from_numpy(visible)
+        ctx.mark_non_differentiable(visible_mask)
+        return image, transmittance, visible_mask
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        lists: TileLists = ctx.lists
+        image, transmittance, opacities = ctx.saved_tensors
+        cutoff, cap, stop = ctx.thresholds
+        moments = np.empty((len(lists.entries), MOMENTS), np.float32)
+        blend_backward(
+            lists.packed,
+            lists.starts,
+            lists.entries,
+            ctx.ends,
+            cutoff,
+            cap,
+            stop,
+            as_array(image),
+            as_array(transmittance),
+            as_array(gradients[0]),
+            as_array(gradients[1]),
+            moments,
+        )
+        m = len(opacities)
+        grad_means2d, grad_covariances = image.new_zeros(m, 2), image.new_zeros(m, 3)
+        grad_opacities, grad_colors = image.new_zeros(m), image.new_zeros(m, 3)
+        sum_moments(
+            lists.packed,
+            lists.order,
+            lists.first_slot,
+            lists.slots_used,
+            lists.slots,
+            moments,
+            as_array(opacities),
+            as_array(grad_means2d),
+            as_array(grad_covariances),
+            as_array(grad_opacities),
+            as_array(grad_colors),
+        )
+        return grad_means2d, grad_covariances, grad_opacities, grad_colors, None, None, None, None
+
+
+def blend_thresholds(settings: RasterSettings) -> tuple[np.float32, np.float32, np.float32]:
+    """Alpha cutoff, alpha cap, and the transmittance at which a pixel is finished."""
+    return (
+        np.float32(settings.alpha_cutoff),
+        np.float32(settings.alpha_cap),
+        np.float32(settings.transmittance_stop),
+    )

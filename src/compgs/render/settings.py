@@ -1,0 +1,35 @@
+"""The conventions of rasterization: those of 3DGS and gsplat, so that a scene looks as it does elsewhere."""
+
+from dataclasses import dataclass
+
+from compgs.cameras import Camera
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """How splats become pixels; the same numbers for every backend."""
+
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB, 0 to 1, behind the last splat
+    near_plane: float = 0.01  # world units; a Gaussian whose centre is nearer is not drawn (gsplat)
+    dilation: float = (
+        0.3  # pixels^2 added to the projected variances: no splat is thinner than a pixel (3DGS)
+    )
+    alpha_cutoff: float = 1.0 / 255.0  # a splat touches only pixels where its alpha reaches this (3DGS)
+    alpha_cap: float = 0.999  # no splat is more opaque than this (gsplat)
+    transmittance_stop: float = 1e-4  # a pixel is finished before its transmittance falls to this (3DGS)
+    margin: float = 0.3  # half images; beyond the image plus this margin the Jacobian is held constant (3DGS)
+
+
+DEFAULT_SETTINGS = RasterSettings()
+
+
+def jacobian_limits(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:
+    """Ranges of x/z (left, right) and y/z (top, bottom) where the Jacobian follows the mean."""
+    wide = settings.margin * 0.5 * camera.width / camera.fx
+    high = settings.margin * 0.5 * camera.height / camera.fy
+    return (
+        -camera.cx / camera.fx - wide,
+        (camera.width - camera.cx) / camera.fx + wide,
+        -camera.cy / camera.fy - high,
+        (camera.height - camera.cy) / camera.fy + high,
+    )

@@ -1,0 +1,287 @@
+"""Alpha blending of tiles on the CPU, forward and backward.
+
+A tile is 8 x 32 pixels. Its pixels lie in vectors of LANES = 16: eight columns by two rows, which small
+splats fill better than a row of sixteen. For every entry of a tile, front to back, and every vector of its
+rows:
+
+    q = |L^T d|^2 - log2 opacity     alpha = 2^-q   (0 below the cutoff, at most the cap)
+    color += alpha T color_i         T <- T (1 - alpha)
+
+The sign of T marks a finished pixel. The backward pass runs front to back as well: it carries what is still
+to come, D = sum over the splats behind of (color . gradient) weight, and dL/dalpha = T (color . gradient) - D
+/ (1 - alpha). Gradients of a splat are written once per tile and summed per splat afterwards, always in the
+same order: no atomics, and the same bits with any number of threads.
+
+Indices are unsigned and the scratch is one buffer with constant offsets; otherwise the loops are not
+vectorized, which costs a factor of ten and is silent (a test looks for vector instructions).
+"""
+
+import numpy as np
+from numba import njit, prange
+
+from compgs.render.binning import CHUNKS, EXP2_SCALE, TILE_HEIGHT, TILE_WIDTH, chunk_bounds
+
+FASTMATH = {"contract", "reassoc", "nsz", "arcp", "nnan", "ninf"}
+f32 = np.float32
+ZERO, HALF, ONE = f32(0), f32(0.5), f32(1)
+MOMENTS = 9  # gradient sums of a splat in a tile: alpha, d (2), d d^T (3), color (3)
+ENTRIES_PER_CHECK = 16  # between two tests whether a tile is finished
+
+U = np.uint64
+U0 = U(0)
+N_LANES = U(16)
+PIXELS = U(TILE_WIDTH * TILE_HEIGHT)
+LAST_LANE_COLUMN = np.uint32(TILE_WIDTH - 1)  # lane i: column i & 7, row i >> 3
+LANE_ROW = np.uint32(3)
+ROWS_PER_VECTOR = 16 // TILE_WIDTH
+# Offsets in the scratch buffer. T first; then color (forward), or the image's gradient and D (backward).
+RED, GREEN, BLUE, BEHIND = PIXELS, U(2) * PIXELS, U(3) * PIXELS, U(4) * PIXELS
+SUM0 = U(5) * PIXELS
+SUM1, SUM2, SUM3, SUM4, SUM5 = (SUM0 + U(16 * n) for n in range(1, 6))
+FORWARD_SCRATCH = 4 * TILE_WIDTH * TILE_HEIGHT
+BACKWARD_SCRATCH = 5 * TILE_WIDTH * TILE_HEIGHT + 6 * 16
+
+# 2^f on [0, 1): least maximal relative error, 1.6e-7 with float32 rounding. An error of 1e-5 would already
+# flip decisions at the alpha cutoff and show in the image.
+E0, E1, E2 = f32(0.9999999251), f32(0.6931530732), f32(0.2401536171)
+E3, E4, E5 = f32(0.05582631792), f32(0.008989340252), f32(0.001877576608)
+LARGEST_EXPONENT = f32(126)
+
+
+@njit(inline="always")
+def exp2_minus(q):
+    """2^-q for q up to 126 (beyond: 2^-126), vectorizable."""
+    t = -min(q, LARGEST_EXPONENT)
+    whole = np.floor(t)
+    f = t - whole
+    p = E0 + f * (E1 + f * (E2 + f * (E3 + f * (E4 + f * E5))))
+    return p * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+def blend_forward(packed, starts, entries, background, cutoff, cap, stop, image, transmittance, ends):
+    """Fills image [H, W, 3], transmittance [H, W] and, per tile, the entry after the last one needed."""
+    height, width = transmittance.shape
+    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    for tile in prange(starts.shape[0] - 1):
+        tile_y, tile_x = tile // tiles_x, tile % tiles_x
+        left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
+        x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
+        s = np.zeros(FORWARD_SCRATCH, np.float32)
+        start_transmittance(s, left, top, width, height)
+        k, end = starts[tile], starts[tile + 1]
+        while k < end:
+            check = min(k + ENTRIES_PER_CHECK, end)
+            for e in range(k, check):
+                i = entries[e, 0]
+                x, y = packed[i, 0] - x_origin, packed[i, 1] - y_origin
+                l00, l10, l11, log2_opacity = packed[i, 2], packed[i, 3], packed[i, 4], packed[i, 5]
+                red, green, blue = packed[i, 6], packed[i, 7], packed[i, 8]
+                first = (entries[e, 1] >> 8) // ROWS_PER_VECTOR
+                last = (entries[e, 1] & 255) // ROWS_PER_VECTOR
+                for vector in range(first, last + 1):
+                    dy_first = y - f32(vector * ROWS_PER_VECTOR)
+                    base = U(vector) * N_LANES
+                    for lane in range(N_LANES):
+                        dx = x - f32(np.uint32(lane) & LAST_LANE_COLUMN)
+                        dy = dy_first - f32(np.uint32(lane) >> LANE_ROW)
+                        p, r = l00 * dx + l10 * dy, l11 * dy
+                        alpha = min(cap, exp2_minus(p * p + (r * r - log2_opacity)))
+                        alpha = alpha if alpha >= cutoff else ZERO
+                        t = s[base + lane]
+                        weight = alpha * t
+                        t_next = t - weight
+                        open_ = t_next > stop
+                        weight = weight if open_ else ZERO
+                        s[base + lane] = t_next if open_ else -abs(t)
+                        s[base + lane + RED] += weight * red
+                        s[base + lane + GREEN] += weight * green
+                        s[base + lane + BLUE] += weight * blue
+            k = check
+            most = ZERO
+            for p in range(PIXELS):
+                most = max(most, s[p])
+            if most <= ZERO:
+                break
+        ends[tile] = k
+        for row in range(min(TILE_HEIGHT, height - top)):
+            for column in range(min(TILE_WIDTH, width - left)):
+                pixel = U(row * TILE_WIDTH + column)
+                t = abs(s[pixel])
+                image[top + row, left + column, 0] = s[pixel + RED] + t * background[0]
+                image[top + row, left + column, 1] = s[pixel + GREEN] + t * background[1]
+                image[top + row, left + column, 2] = s[pixel + BLUE] + t * background[2]
+                transmittance[top + row, left + column] = t
+
+
+@njit(inline="always")
+def start_transmittance(s, left, top, width, height):
+    """One inside the image; minus one (finished) for a tile's pixels beyond its edge."""
+    columns, rows = width - left, height - top
+    for row in range(TILE_HEIGHT):
+        for column in range(TILE_WIDTH):
+            s[U(row * TILE_WIDTH + column)] = ONE if row < rows and column < columns else -ONE
+
+
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+def blend_backward(
+    packed,
+    starts,
+    entries,
+    ends,
+    cutoff,
+    cap,
+    stop,
+    image,
+    transmittance,
+    grad_image,
+    grad_transmittance,
+    moments,
+):
+    """Fills moments [E, MOMENTS]: for each entry the sums over its pixels that gradients are made of.
+
+    With v = alpha dL/dalpha: v, v dx, v dy, v dx^2, v dx dy, v dy^2, then weight * dL/dimage for the three
+    colors.
+    """
+    height, width = transmittance.shape
+    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    for tile in prange(starts.shape[0] - 1):
+        tile_y, tile_x = tile // tiles_x, tile % tiles_x
+        left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
+        x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
+        s = np.zeros(BACKWARD_SCRATCH, np.float32)
+        start_transmittance(s, left, top, width, height)
+        for row in range(min(TILE_HEIGHT, height - top)):
+            for column in range(min(TILE_WIDTH, width - left)):
+                pixel = U(row * TILE_WIDTH + column)
+                g0 = grad_image[top + row, left + column, 0]
+                g1 = grad_image[top + row, left + column, 1]
+                g2 = grad_image[top + row, left + column, 2]
+                behind = g0 * image[top + row, left + column, 0] + g1 * image[top + row, left + column, 1]
+                behind += g2 * image[top + row, left + column, 2]
+                behind += (
+                    grad_transmittance[top + row, left + column] * transmittance[top + row, left + column]
+                )
+                s[pixel + RED], s[pixel + GREEN], s[pixel + BLUE], s[pixel + BEHIND] = g0, g1, g2, behind
+        for e in range(starts[tile], ends[tile]):
+            i = entries[e, 0]
+            x, y = packed[i, 0] - x_origin, packed[i, 1] - y_origin
+            l00, l10, l11, log2_opacity = packed[i, 2], packed[i, 3], packed[i, 4], packed[i, 5]
+            red, green, blue = packed[i, 6], packed[i, 7], packed[i, 8]
+            first = (entries[e, 1] >> 8) // ROWS_PER_VECTOR
+            last = (entries[e, 1] & 255) // ROWS_PER_VECTOR
+            for lane in range(N_LANES):
+                s[lane + SUM0] = ZERO
+                s[lane + SUM1] = ZERO
+                s[lane + SUM2] = ZERO
+                s[lane + SUM3] = ZERO
+                s[lane + SUM4] = ZERO
+                s[lane + SUM5] = ZERO
+            for vector in range(first, last + 1):
+                dy_first = y - f32(vector * ROWS_PER_VECTOR)
+                base = U(vector) * N_LANES
+                for lane in range(N_LANES):
+                    dx = x - f32(np.uint32(lane) & LAST_LANE_COLUMN)
+                    dy = dy_first - f32(np.uint32(lane) >> LANE_ROW)
+                    p, r = l00 * dx + l10 * dy, l11 * dy
+                    uncapped = exp2_minus(p * p + (r * r - log2_opacity))
+                    alpha = min(cap, uncapped)
+                    alpha = alpha if alpha >= cutoff else ZERO
+                    t = s[base + lane]
+                    weight = alpha * t
+                    t_next = t - weight
+                    open_ = t_next > stop
+                    weight = weight if open_ else ZERO
+                    s[base + lane] = t_next if open_ else -abs(t)
+                    g0, g1, g2 = s[base + lane + RED], s[base + lane + GREEN], s[base + lane + BLUE]
+                    color_grad = g0 * red + g1 * green + g2 * blue
+                    behind = s[base + lane + BEHIND] - weight * color_grad
+                    s[base + lane + BEHIND] = behind
+                    # Kept pixels only; a capped alpha does not change with the splat.
+                    v = weight * color_grad - alpha * behind / (ONE - alpha)
+                    v = v if open_ else ZERO
+                    v = v if uncapped <= cap else ZERO
+                    s[lane + SUM0] += v
+                    s[lane + SUM1] += v * dy
+                    s[lane + SUM2] += v * dy * dy
+                    s[lane + SUM3] += weight * g0
+                    s[lane + SUM4] += weight * g1
+                    s[lane + SUM5] += weight * g2
+            m0, mx, my, mxx, mxy, myy, m_red, m_green, m_blue = (
+                ZERO,
+                ZERO,
+                ZERO,
+                ZERO,
+                ZERO,
+                ZERO,
+                ZERO,
+                ZERO,
+                ZERO,
+            )
+            for lane in range(N_LANES):
+                dx = x - f32(np.uint32(lane) & LAST_LANE_COLUMN)
+                v, v_dy = s[lane + SUM0], s[lane + SUM1]
+                m0 += v
+                mx += v * dx
+                my += v_dy
+                mxx += v * dx * dx
+                mxy += v_dy * dx
+                myy += s[lane + SUM2]
+                m_red += s[lane + SUM3]
+                m_green += s[lane + SUM4]
+                m_blue += s[lane + SUM5]
+            moments[e, 0] = m0
+            moments[e, 1] = mx
+            moments[e, 2] = my
+            moments[e, 3] = mxx
+            moments[e, 4] = mxy
+            moments[e, 5] = myy
+            moments[e, 6] = m_red
+            moments[e, 7] = m_green
+            moments[e, 8] = m_blue
+        for e in range(ends[tile], starts[tile + 1]):
+            for moment in range(MOMENTS):
+                moments[e, moment] = ZERO
+
+
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+def sum_moments(
+    packed, order, first_slot, slots_used, slots, moments, opacities,
+    grad_means, grad_covariances, grad_opacities, grad_colors,
+):  # fmt: skip
+    """Adds up each splat's tiles, and turns moments into gradients; rows of other Gaussians are untouched.
+
+    With X = cov^-1 and alpha = opacity exp(-d^T X d / 2): dL/dmean = -X sum(v d), dL/dcov = X sum(v d d^T) X
+    / 2.
+    """
+    for chunk in prange(CHUNKS):
+        begin, end = chunk_bounds(chunk, order.shape[0])
+        for i in range(begin, end):
+            m0, mx, my, mxx, mxy, myy, red, green, blue = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+            for slot in range(first_slot[i], first_slot[i] + slots_used[i]):
+                e = slots[slot]
+                m0 += moments[e, 0]
+                mx += moments[e, 1]
+                my += moments[e, 2]
+                mxx += moments[e, 3]
+                mxy += moments[e, 4]
+                myy += moments[e, 5]
+                red += moments[e, 6]
+                green += moments[e, 7]
+                blue += moments[e, 8]
+            g = order[i]
+            # X = L L^T, with the scale of the packed factor taken out
+            l00, l10, l11 = packed[i, 2] / EXP2_SCALE, packed[i, 3] / EXP2_SCALE, packed[i, 4] / EXP2_SCALE
+            # moments in whitened coordinates w = L^T d first: fewer digits cancel for long thin splats
+            wx, wy = l00 * mx + l10 * my, l11 * my
+            wxx = l00 * l00 * mxx + f32(2) * l00 * l10 * mxy + l10 * l10 * myy
+            wxy, wyy = l11 * (l00 * mxy + l10 * myy), l11 * l11 * myy
+            grad_means[g, 0] = -l00 * wx
+            grad_means[g, 1] = -(l10 * wx + l11 * wy)
+            grad_covariances[g, 0] = HALF * l00 * l00 * wxx
+            grad_covariances[g, 1] = l00 * (l10 * wxx + l11 * wxy)
+            grad_covariances[g, 2] = HALF * (l10 * l10 * wxx + f32(2) * l10 * l11 * wxy + l11 * l11 * wyy)
+            grad_opacities[g] = m0 / opacities[g]
+            grad_colors[g, 0] = red
+            grad_colors[g, 1] = green
+            grad_colors[g, 2] = blue
