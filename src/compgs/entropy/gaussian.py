@@ -13,8 +13,8 @@ and gradient are good at any distance. With the scaled tail E(t) = exp(t^2 / 2) 
     l >= 0:  log p = -l^2 / 2 + log D    D = E(l) - r E(u)                          r = exp(-|x| / sigma^2)
     l <  0:  log p = log D               D = 1 - exp(-l^2 / 2) E(-l) - exp(-u^2 / 2) E(u)
 
-One vectorized pass on the CPU computes the bits, another the gradient; the second evaluates p again, which
-costs less than keeping anything for it.
+On the CPU one vectorized pass computes the bits and both derivatives, which share nearly everything; the
+backward pass only scales them.
 """
 
 import math
@@ -178,47 +178,51 @@ def _interval(x, s):
 
 
 @njit(fastmath=_FASTMATH, cache=True, error_model="numpy")
-def _element_bits(x, s, bits):
-    """All flat, same length. Kept apart from the parallel loop so that LLVM vectorizes it."""
+def _element_bits(x, s, bits, d_x, d_s):
+    """Bits and their derivatives; all flat. Kept apart from the parallel loop so that LLVM vectorizes it."""
     for i in range(np.uint64(x.size)):
-        _, l, _, _, _, d = _interval(x[i], s[i])
+        inverse, l, u, e_l, e_u, d = _interval(x[i], s[i])
+        weight = _ONE / d
+        dx = _GRADIENT * weight * inverse * (e_l - e_u)
+        d_x[i] = dx if x[i] > _ZERO else -dx
+        d_s[i] = _GRADIENT_S * weight * (e_u * u - e_l * l)
         l = _ZERO if l < _ZERO else l
         bits[i] = _HALF_LOG2_E * l * l - _log2(d)
 
 
-@njit(fastmath=_FASTMATH, cache=True, error_model="numpy")
-def _element_gradient(x, s, g, d_x, d_s):
-    """All flat, same length; g: gradient of each element's bits."""
-    for i in range(np.uint64(x.size)):
-        inverse, l, u, e_l, e_u, d = _interval(x[i], s[i])
-        weight = g[i] / d
-        dx = _GRADIENT * weight * inverse * (e_l - e_u)
-        d_x[i] = dx if x[i] > _ZERO else -dx
-        ds = _GRADIENT_S * weight * (e_u * u - e_l * l)
-        ds = _ZERO if (s[i] < _ZERO and ds > _ZERO) else ds
-        d_s[i] = _ZERO if (s[i] > _TOP_F and ds < _ZERO) else ds
+@njit(fastmath=_FASTMATH, cache=True)
+def _element_gradient(s, g, by_x, by_s, d_x, d_s):
+    """Chain rule; all flat. A gradient that leads s away from the tables is dropped."""
+    for i in range(np.uint64(s.size)):
+        d_x[i] = g[i] * by_x[i]
+        d = g[i] * by_s[i]
+        d = _ZERO if (s[i] < _ZERO and d > _ZERO) else d
+        d_s[i] = _ZERO if (s[i] > _TOP_F and d < _ZERO) else d
 
 
 @njit(parallel=True, fastmath=_FASTMATH, cache=True)
-def _bits(x, s, channels, bits):
-    """x, s flat [N * C] -> bits [N]."""
+def _bits(x, s, channels, bits, by_x, by_s):
+    """x, s flat [N * C] -> bits [N] and derivatives by_x, by_s, flat as x, or empty if not wanted."""
     N = len(bits)
     rows = max(1, _BLOCK // max(channels, 1))
     for block in prange((N + rows - 1) // rows):
-        scratch = np.empty(rows * channels, np.float32)
+        scratch = np.empty((3, rows * channels), np.float32)
         first, last = block * rows, min(N, (block + 1) * rows)
         p, q = first * channels, last * channels
-        _element_bits(x[p:q], s[p:q], scratch)
+        if by_x.size > 0:
+            _element_bits(x[p:q], s[p:q], scratch[0], by_x[p:q], by_s[p:q])
+        else:
+            _element_bits(x[p:q], s[p:q], scratch[0], scratch[1], scratch[2])
         for r in range(last - first):
             total = _ZERO
             for c in range(channels):
-                total += scratch[r * channels + c]
+                total += scratch[0, r * channels + c]
             bits[first + r] = total
 
 
 @njit(parallel=True, fastmath=_FASTMATH, cache=True)
-def _bits_gradient(x, s, channels, g, d_x, d_s):
-    """g [N], the gradient of the bits -> gradients d_x, d_s, flat [N * C] as x and s."""
+def _bits_gradient(s, channels, g, by_x, by_s, d_x, d_s):
+    """g [N], the gradient of the bits -> gradients d_x, d_s, flat [N * C] as s."""
     N = len(g)
     rows = max(1, _BLOCK // max(channels, 1))
     for block in prange((N + rows - 1) // rows):
@@ -228,7 +232,7 @@ def _bits_gradient(x, s, channels, g, d_x, d_s):
             for c in range(channels):
                 scratch[r * channels + c] = g[first + r]
         p, q = first * channels, last * channels
-        _element_gradient(x[p:q], s[p:q], scratch, d_x[p:q], d_s[p:q])
+        _element_gradient(s[p:q], scratch, by_x[p:q], by_s[p:q], d_x[p:q], d_s[p:q])
 
 
 def _flat(x: Tensor) -> np.ndarray:
@@ -240,14 +244,16 @@ class _FusedBits(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, s: Tensor) -> Tensor:
         x, s = x.contiguous(), s.contiguous()
         bits = x.new_empty(len(x))
-        _bits(_flat(x), _flat(s), x.shape[1], bits.numpy())
-        ctx.save_for_backward(x, s)
+        wanted = len(x) if any(ctx.needs_input_grad) else 0
+        by_x, by_s = x.new_empty(wanted, x.shape[1]), s.new_empty(wanted, s.shape[1])
+        _bits(_flat(x), _flat(s), x.shape[1], bits.numpy(), _flat(by_x), _flat(by_s))
+        ctx.save_for_backward(s, by_x, by_s)
         return bits
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
-        x, s = ctx.saved_tensors
-        d_x, d_s = torch.empty_like(x), torch.empty_like(s)
-        g = grads[0].contiguous()
-        _bits_gradient(_flat(x), _flat(s), x.shape[1], g.numpy(), _flat(d_x), _flat(d_s))
+        s, by_x, by_s = ctx.saved_tensors
+        d_x, d_s = torch.empty_like(by_x), torch.empty_like(by_s)
+        g = grads[0].contiguous().numpy()
+        _bits_gradient(_flat(s), s.shape[1], g, _flat(by_x), _flat(by_s), _flat(d_x), _flat(d_s))
         return d_x, d_s

@@ -7,8 +7,8 @@
 
 `H` is the hidden width, `O` the outputs, `G` the residual channels. Coupled primitives are taken ROWS at a
 time, so that all activations of a group stay in the core's cache; the products are BLAS calls on such groups
-(2.5 times the rate of the vector code that LLVM makes of the same loops). Nothing is kept for the backward
-pass: computing the activations again is cheaper than writing them to memory and reading them back.
+(a whole pass takes 0.55 to 0.6 of the time of the same sums as loops vectorized by LLVM). Nothing is kept for
+the backward pass but the inputs: the activations are computed again, group by group.
 
 Gradients of the weights are sums over all primitives: they are accumulated in CHUNKS parts and then added in
 order. Parts end where an anchor ends, so that each anchor's gradient is summed by one thread. The result
