@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from numba import njit, prange
 
-from compgs.codec.integer_network import FRACTION_BITS, IntegerNetwork, entropy_parameters
+from compgs.codec.integer_network import FRACTION_BITS, IntegerNetwork, entropy_parameters, first_rows
 from compgs.codec.rans import escape_bits
 from compgs.codec.tables import FrequencyTables, HyperTable, channel_tables, gaussian_tables
 from compgs.codec.weights import QuantizedTensor
@@ -92,10 +93,9 @@ def fixed_point(symbols: np.ndarray) -> np.ndarray:  # int32, Q12
 
 
 def reconstruct(symbols: np.ndarray, means: np.ndarray) -> np.ndarray:  # int32, Q12
-    """Latents from symbols and means (same shape, Q12)."""
-    latents = symbols << FRACTION_BITS
-    latents += means
-    return latents
+    """Latents from symbols and means (same shape, Q12); they take the means' place."""
+    _add_steps(symbols.reshape(-1), means.reshape(-1))
+    return means
 
 
 def residual_context(residual_hyper: np.ndarray, reference_latents: np.ndarray) -> np.ndarray:
@@ -103,10 +103,42 @@ def residual_context(residual_hyper: np.ndarray, reference_latents: np.ndarray) 
     return np.concatenate([fixed_point(residual_hyper), reference_latents], 1)
 
 
-def existing(values: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [P, D]
-    """Rows of the coupled primitives that exist; `values` is [N, K, D] or [N, K * D]."""
-    rows = values.reshape(mask.size, -1)
-    return rows if mask.all() else rows[mask.ravel()]
+def gather_existing(slots: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [P, D]
+    """Of [N, K, D], the coupled primitives that exist [N, K], anchor by anchor."""
+    rows = first_rows(mask)
+    out = np.empty((int(rows[-1]), slots.shape[2]), np.int32)
+    _move_rows(slots, out, mask, rows, True)
+    return out
+
+
+def scatter_existing(existing: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [N, K, D]
+    """Inverse of `gather_existing`; zero where nothing exists."""
+    slots = np.empty((*mask.shape, existing.shape[1]), np.int32)
+    _move_rows(slots, existing, mask, first_rows(mask), False)
+    return slots
+
+
+@njit(cache=True, parallel=True)
+def _add_steps(symbols, means):
+    for i in prange(len(symbols)):
+        means[i] += symbols[i] << FRACTION_BITS
+
+
+@njit(cache=True, parallel=True)
+def _move_rows(slots, existing, mask, rows, gather):
+    for n in prange(len(mask)):
+        row = rows[n]
+        for k in range(mask.shape[1]):
+            if not mask[n, k]:
+                if not gather:
+                    slots[n, k, :] = 0
+                continue
+            for c in range(slots.shape[2]):
+                if gather:
+                    existing[row, c] = slots[n, k, c]
+                else:
+                    slots[n, k, c] = existing[row, c]
+            row += 1
 
 
 def channel_index(anchors: int, channels: int) -> np.ndarray:  # [N, C] uint8
@@ -121,8 +153,8 @@ def dequantize(content: FileContent) -> Latents:
     means, _ = entropy_parameters(content.networks["covariance"], reference)
     covariance = reconstruct(content.covariance, means)
     context = residual_context(content.residual_hyper, reference)
-    means, _ = entropy_parameters(content.networks["residual"], context)
-    residual = reconstruct(existing(content.residual, content.mask), existing(means, content.mask))
+    means, _ = entropy_parameters(content.networks["residual"], context, content.mask)
+    residual = reconstruct(gather_existing(content.residual, content.mask), means)
     return Latents(reference, covariance, residual)
 
 
@@ -150,6 +182,6 @@ def cross_entropy_bits(content: FileContent) -> dict[str, float]:
         gaussian,
     )
     context = residual_context(content.residual_hyper, reference)
-    index = entropy_parameters(content.networks["residual"], context)[1]
-    add("residual", existing(content.residual, content.mask), existing(index, content.mask), gaussian)
+    index = entropy_parameters(content.networks["residual"], context, content.mask)[1]
+    add("residual", gather_existing(content.residual, content.mask), index, gaussian)
     return {name: result[name] for name in STREAMS}

@@ -23,7 +23,8 @@ MAX_SHIFT = 30
 BIAS_LIMIT = 1 << 31  # absolute value of a bias
 ACCUMULATOR_LIMIT = 1 << 52
 SCALE_TABLES = 128
-BLOCK_ROWS = 2048  # rows evaluated at a time: memory, not results, depends on it
+BLOCK_ROWS = 1 << 15  # rows evaluated at a time: memory, not results, depends on it
+TASK_ROWS = 64  # rows that a thread takes at a time
 
 
 @dataclass(frozen=True)
@@ -76,44 +77,80 @@ def evaluate(
     x: np.ndarray,  # [N, inputs] integers, Q12; values outside the activations' range are clamped to it
 ) -> np.ndarray:  # [N, outputs] int32, Q12
     """The network's outputs, exactly: they do not depend on batch size, order, threads or device."""
-    assert x.ndim == 2 and x.shape[1] == network.inputs
     out = np.empty((len(x), network.outputs), np.int32)
     last = network.layers[-1]
-    for start, sums in _last_sums(network, x):
-        _finish(sums, last.bias, last.shift, last.rectify)
-        out[start : start + len(sums)] = sums
+    for start, block in _inputs_of_last(network, x):
+        _layer(block, _matrix(last), last.bias, last.shift, last.rectify, out[start : start + len(block)])
     return out
 
 
 def entropy_parameters(
     network: IntegerNetwork,
     x: np.ndarray,  # [N, inputs] Q12: what the decoder knows by then
-) -> tuple[np.ndarray, np.ndarray]:  # [N, C] int32 means Q12, [N, C] uint8 Gaussian tables
-    """Means and scale tables of a stream's C channels (CompGS Sec. 3.3): the outputs are [means | scales].
+    mask: np.ndarray | None = None,  # [N, K] bool: only the channels of these slots are wanted
+) -> tuple[np.ndarray, np.ndarray]:
+    """Means (Q12, int32) and Gaussian tables (uint8) of the symbols (CompGS Sec. 3.3).
 
-    table = clamp((scale + 2048) >> 12, 0, 127): a scale output of one is a twelfth of an octave.
+    Both are [N, C] or, with a mask, [P, C / K], one row for each slot that exists.
+
+    The outputs are [means | scales]; table = clamp((scale + 2048) >> 12, 0, 127): a scale output of one is a
+    twelfth of an octave.
     """
-    assert x.ndim == 2 and x.shape[1] == network.inputs
     channels = network.outputs // 2
-    means = np.empty((len(x), channels), np.int32)
-    index = np.empty((len(x), channels), np.uint8)
+    if mask is None:
+        mask = np.ones((len(x), 1), np.bool_)
+    rows = first_rows(mask)
+    means = np.empty((int(rows[-1]), channels // mask.shape[1]), np.int32)
+    index = np.empty(means.shape, np.uint8)
     last = network.layers[-1]
-    for start, sums in _last_sums(network, x):
-        block = slice(start, start + len(sums))
-        _finish_parameters(sums, last.bias, last.shift, last.rectify, means[block], index[block])
+    for start, block in _inputs_of_last(network, x):
+        part = slice(start, start + len(block))
+        _parameters(
+            block, _matrix(last), last.bias, last.shift, last.rectify, mask[part], rows[part], means, index
+        )
     return means, index
 
 
-def _last_sums(network: IntegerNetwork, x: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """(first row, W x of the last layer as float64) of one block of rows after the other."""
-    weights = [np.ascontiguousarray(layer.weight.T, np.float64) for layer in network.layers]
+def first_rows(mask: np.ndarray) -> np.ndarray:  # [N + 1] int64
+    """Row of each anchor's first existing slot [N, K], and the number of all behind them."""
+    rows = np.zeros(len(mask) + 1, np.int64)
+    np.cumsum(np.count_nonzero(mask, axis=1), out=rows[1:])
+    return rows
+
+
+def _inputs_of_last(network: IntegerNetwork, x: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """(first row, inputs of the last layer) of one block of rows after the other."""
+    assert x.ndim == 2 and x.shape[1] == network.inputs
     for start in range(0, len(x), BLOCK_ROWS):
-        block = x[start : start + BLOCK_ROWS]
-        block = np.clip(block, -ACTIVATION_LIMIT, ACTIVATION_LIMIT - 1).astype(np.float64)
-        for weight, layer in zip(weights[:-1], network.layers[:-1], strict=True):
-            block = block @ weight
-            _finish(block, layer.bias, layer.shift, layer.rectify)
-        yield start, block @ weights[-1]
+        block = np.ascontiguousarray(x[start : start + BLOCK_ROWS])
+        for layer in network.layers[:-1]:
+            out = np.empty((len(block), len(layer.bias)), np.int32)
+            _layer(block, _matrix(layer), layer.bias, layer.shift, layer.rectify, out)
+            block = out
+        yield start, block
+
+
+def _matrix(layer: IntegerLayer) -> np.ndarray:
+    """[inputs rounded up to 4, outputs] float64."""
+    inputs = layer.weight.shape[1]
+    matrix = np.zeros((-(-inputs // 4) * 4, layer.weight.shape[0]))
+    matrix[:inputs] = layer.weight.T
+    return matrix
+
+
+@njit(cache=True, inline="always")
+def _sums(x, weight, inputs, sums):
+    """W x of one row. Four inputs at a time, so that each sum is loaded and stored once for four products."""
+    for i in range(len(x)):
+        v = min(np.int64(x[i]), ACTIVATION_LIMIT - 1)
+        inputs[i] = max(v, -ACTIVATION_LIMIT)
+    sums[:] = 0.0
+    for i in range(0, len(inputs), 4):
+        a, b, c, d = inputs[i], inputs[i + 1], inputs[i + 2], inputs[i + 3]
+        for o in range(len(sums)):
+            sums[o] += (a * weight[i, o] + b * weight[i + 1, o]) + (
+                c * weight[i + 2, o] + d * weight[i + 3, o]
+            )
 
 
 @njit(cache=True, inline="always")
@@ -126,24 +163,38 @@ def _activation(a, bias, half, scale, rectify):
 
 
 @njit(cache=True, parallel=True)
-def _finish(sums, bias, shift, rectify):
+def _layer(x, weight, bias, shift, rectify, out):
     scale = 1.0 / (1 << shift)
     half = float(1 << (shift - 1)) if shift > 0 else 0.0
-    for n in prange(sums.shape[0]):
-        for c in range(sums.shape[1]):
-            sums[n, c] = _activation(sums[n, c], float(bias[c]), half, scale, rectify)
+    for block in prange((len(x) + TASK_ROWS - 1) // TASK_ROWS):
+        sums = np.empty(out.shape[1])
+        inputs = np.zeros(len(weight))
+        for n in range(block * TASK_ROWS, min((block + 1) * TASK_ROWS, len(x))):
+            _sums(x[n], weight, inputs, sums)
+            for c in range(out.shape[1]):
+                out[n, c] = np.int32(_activation(sums[c], float(bias[c]), half, scale, rectify))
 
 
 @njit(cache=True, parallel=True)
-def _finish_parameters(sums, bias, shift, rectify, means, index):
+def _parameters(x, weight, bias, shift, rectify, mask, rows, means, index):
     scale = 1.0 / (1 << shift)
     half = float(1 << (shift - 1)) if shift > 0 else 0.0
-    channels = means.shape[1]
-    for n in prange(sums.shape[0]):
-        for c in range(channels):
-            means[n, c] = np.int32(_activation(sums[n, c], float(bias[c]), half, scale, rectify))
-        for c in range(channels):
-            i = channels + c
-            y = np.int32(_activation(sums[n, i], float(bias[i]), half, scale, rectify))
-            table = (y + (1 << (FRACTION_BITS - 1))) >> FRACTION_BITS
-            index[n, c] = min(max(table, 0), SCALE_TABLES - 1)
+    slots, channels = mask.shape[1], means.shape[1]
+    for block in prange((len(x) + TASK_ROWS - 1) // TASK_ROWS):
+        sums = np.empty(weight.shape[1])
+        inputs = np.zeros(len(weight))
+        for n in range(block * TASK_ROWS, min((block + 1) * TASK_ROWS, len(x))):
+            _sums(x[n], weight, inputs, sums)
+            row = rows[n]
+            for k in range(slots):
+                if not mask[n, k]:
+                    continue
+                for c in range(channels):
+                    i = k * channels + c
+                    means[row, c] = np.int32(_activation(sums[i], float(bias[i]), half, scale, rectify))
+                for c in range(channels):
+                    i = (slots + k) * channels + c
+                    y = np.int32(_activation(sums[i], float(bias[i]), half, scale, rectify))
+                    table = (y + (1 << (FRACTION_BITS - 1))) >> FRACTION_BITS
+                    index[row, c] = min(max(table, 0), SCALE_TABLES - 1)
+                row += 1

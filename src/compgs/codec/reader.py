@@ -10,10 +10,10 @@ from compgs.codec.content import (
     FileContent,
     Latents,
     channel_index,
-    existing,
     fixed_point,
     reconstruct,
     residual_context,
+    scatter_existing,
 )
 from compgs.codec.format import (
     COVARIANCE,
@@ -135,11 +135,10 @@ def read_latents(data: bytes) -> tuple[FileContent, Latents]:
     index = channel_index(scene.anchors, d.residual_hyper_dim)
     residual_hyper = stream(RESIDUAL_HYPER, index, channel_tables(residual_hyper_tables))
     context = residual_context(residual_hyper, reference_latents)
-    means, index = entropy_parameters(networks["residual"], context)
-    index = existing(index.reshape(*mask.shape, d.residual_dim), mask)
+    means, index = entropy_parameters(networks["residual"], context, mask)
     symbols = stream(RESIDUAL, index, gaussian)
-    residual_latents = reconstruct(symbols, existing(means.reshape(*mask.shape, d.residual_dim), mask))
-    residual = _scattered(symbols, mask)
+    residual = scatter_existing(symbols, mask)
+    residual_latents = reconstruct(symbols, means)
 
     content = FileContent(
         dimensions=d,
@@ -198,12 +197,3 @@ def _check_amount(scene: SceneSection, size: int) -> None:
             f"{SECTION_NAMES[SCENE]}: {scene.anchors} anchors promise {symbols} symbols, "
             f"a file of {size} bytes holds at most {allowed}"
         )
-
-
-def _scattered(symbols: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [N, K, D]
-    """Inverse of `existing`: symbols [P, D] in their slots, zero elsewhere."""
-    if mask.all():
-        return symbols.reshape(*mask.shape, -1)
-    out = np.zeros((*mask.shape, symbols.shape[1]), np.int32)
-    out[mask] = symbols
-    return out

@@ -9,8 +9,8 @@ from compgs.codec.content import (
     COVARIANCE_DIM,
     FileContent,
     channel_index,
-    existing,
     fixed_point,
+    gather_existing,
     reconstruct,
     residual_context,
 )
@@ -102,9 +102,8 @@ def write_content(content: FileContent) -> bytes:
         Section(RESIDUAL_HYPER, hyper_stream(content.residual_hyper, content.residual_hyper_tables)),
     )
     context = residual_context(content.residual_hyper, reference)
-    _, index = entropy_parameters(networks["residual"], context)
-    symbols = existing(content.residual, content.mask)
-    index = existing(index, content.mask)
+    _, index = entropy_parameters(networks["residual"], context, content.mask)
+    symbols = gather_existing(content.residual, content.mask)
     sections.append(Section(RESIDUAL, encode_symbols(symbols.ravel(), index.ravel(), gaussian)))
 
     if content.metadata:

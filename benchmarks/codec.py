@@ -1,0 +1,234 @@
+"""The codec's speed and memory on a made-up scene, beside constriction on the same symbols in the same run.
+
+    python benchmarks/codec.py [--anchors 300000] [--output codec.json]
+
+Each line is a process of its own, so that peak memory is its own. "compiling" starts with an empty kernel
+cache (the first call after installation), "cold" is the first call of a process that finds its kernels,
+"warm" the best of three.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+CONSTRICTION_SYMBOLS = 2_000_000
+
+
+def timed(function: Callable[[], Any]) -> tuple[float, Any]:
+    start = time.perf_counter()
+    result = function()
+    return time.perf_counter() - start, result
+
+
+def peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+
+
+def make(path: Path, anchors: int) -> dict[str, Any]:
+    """Write the scene that the other processes read."""
+    from made_content import make_content
+
+    from compgs.codec.writer import write_content
+
+    path.write_bytes(write_content(make_content(anchors, 0)))
+    return {}
+
+
+def encode(path: Path) -> dict[str, Any]:
+    from compgs.codec.reader import read_content
+    from compgs.codec.writer import write_content
+
+    data = path.read_bytes()
+    content = read_content(data)
+    before = peak_mb()
+    cold, again = timed(lambda: write_content(content))
+    assert again == data, "encoding a decoded file must give its bytes again"
+    warm = min(timed(lambda: write_content(content))[0] for _ in range(3))
+    return {"cold_s": cold, "warm_s": warm, "peak_mb": peak_mb(), "peak_before_mb": before}
+
+
+def decode(path: Path) -> dict[str, Any]:
+    from compgs.codec.reader import read_latents
+
+    data = path.read_bytes()
+    before = peak_mb()
+    cold, _ = timed(lambda: read_latents(data))
+    warm = min(timed(lambda: read_latents(data))[0] for _ in range(3))
+    return {"cold_s": cold, "warm_s": warm, "peak_mb": peak_mb(), "peak_before_mb": before}
+
+
+def parts(path: Path) -> dict[str, Any]:
+    """Sizes by section, and seconds of the parts of decoding."""
+    import numpy as np
+    from compgs.codec.mask_coder import decode_masks, encode_masks
+
+    from compgs.codec.anchor_order import canonical_order
+    from compgs.codec.content import cross_entropy_bits, fixed_point, reconstruct, residual_context
+    from compgs.codec.integer_network import entropy_parameters
+    from compgs.codec.octree import decode_positions, encode_positions
+    from compgs.codec.rans import decode_symbols, encode_symbols
+    from compgs.codec.reader import file_info, read_content
+    from compgs.codec.tables import gaussian_tables
+
+    data = path.read_bytes()
+    content = read_content(data)
+    info = file_info(data)
+    seconds: dict[str, float] = {}
+
+    def best(name: str, function: Callable[[], Any]) -> Any:
+        runs = [timed(function) for _ in range(3)]
+        seconds[name] = min(run[0] for run in runs)
+        return runs[0][1]
+
+    positions = best("encode positions", lambda: encode_positions(content.coordinates))
+    best("decode positions", lambda: decode_positions(positions, info.anchors))
+    best("order of anchors", lambda: canonical_order(content.coordinates))
+    masks = best("encode masks", lambda: encode_masks(content.mask))
+    best("decode masks", lambda: decode_masks(masks, *content.mask.shape))
+    means, _ = entropy_parameters(content.networks["reference"], fixed_point(content.reference_hyper))
+    context = residual_context(content.residual_hyper, reconstruct(content.reference, means))
+    _, index = best("residual network", lambda: entropy_parameters(content.networks["residual"], context))
+    index, symbols = index.ravel(), content.residual.ravel()
+    stream = best("encode residual symbols", lambda: encode_symbols(symbols, index, gaussian_tables()))
+    best("decode residual symbols", lambda: decode_symbols(stream, index, gaussian_tables()))
+    bits = cross_entropy_bits(content)
+    coded = {s.name: s.bytes for s in info.sections}
+    names = [
+        "reference hyperprior",
+        "reference embeddings",
+        "covariance",
+        "residual hyperprior",
+        "residual embeddings",
+    ]
+    ours = sum(coded[name] for name in names)
+    return {
+        "bytes": info.bytes,
+        "sections": coded,
+        "anchors": info.anchors,
+        "coupled": info.coupled,
+        "symbols": int(info.anchors * (info.dimensions.symbols_per_anchor()) - np.sum(~content.mask) * 8),
+        "residual_symbols": len(symbols),
+        "overhead_percent": (8 * ours / sum(bits.values()) - 1) * 100,
+        "seconds": seconds,
+    }
+
+
+def beside_constriction(path: Path) -> dict[str, Any]:
+    """The first two million reference symbols through both coders, ours with one thread and with all."""
+    import constriction
+    import numba
+    import numpy as np
+
+    from compgs.codec.content import fixed_point
+    from compgs.codec.integer_network import entropy_parameters
+    from compgs.codec.rans import decode_symbols, encode_symbols
+    from compgs.codec.reader import read_content
+    from compgs.codec.tables import gaussian_tables
+
+    content = read_content(path.read_bytes())
+    _, index = entropy_parameters(content.networks["reference"], fixed_point(content.reference_hyper))
+    index = np.ascontiguousarray(index.ravel()[:CONSTRICTION_SYMBOLS])
+    symbols = np.ascontiguousarray(content.reference.ravel()[:CONSTRICTION_SYMBOLS])
+    means, scales = np.zeros(len(index)), 2.0 ** (index / 12 - 5)
+    model = constriction.stream.model.QuantizedGaussian(-1000, 1000)
+    coder = constriction.stream.stack.AnsCoder()
+    theirs_encode, _ = timed(lambda: coder.encode_reverse(symbols, model, means, scales))
+    theirs_bytes = coder.num_bits() / 8
+    theirs_decode, decoded = timed(lambda: coder.decode(model, means, scales))
+    assert (decoded == symbols).all()
+    result: dict[str, Any] = {
+        "symbols": len(symbols),
+        "constriction": {"bytes": theirs_bytes, "encode_s": theirs_encode, "decode_s": theirs_decode},
+    }
+    for threads in sorted({1, numba.get_num_threads()}):
+        numba.set_num_threads(threads)
+        data = encode_symbols(symbols, index, gaussian_tables())
+        e = min(timed(lambda: encode_symbols(symbols, index, gaussian_tables()))[0] for _ in range(3))
+        d = min(timed(lambda: decode_symbols(data, index, gaussian_tables()))[0] for _ in range(3))  # noqa: B023
+        result[f"{threads} threads"] = {"bytes": len(data), "encode_s": e, "decode_s": d}
+    return result
+
+
+JOBS = {"encode": encode, "decode": decode, "parts": parts, "constriction": beside_constriction}
+
+
+def child(job: str, path: Path, anchors: int, environment: dict[str, str] | None = None) -> dict[str, Any]:
+    command = [sys.executable, __file__, "--job", job, "--file", str(path), "--anchors", str(anchors)]
+    result = subprocess.run(
+        command, env=os.environ | (environment or {}), capture_output=True, text=True, check=False
+    )
+    if result.returncode:
+        raise SystemExit(f"{job}: {result.stderr}")
+    return json.loads(result.stdout)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--anchors", type=int, default=300_000)
+    parser.add_argument("--output", type=Path, help="also write the figures as JSON")
+    parser.add_argument("--job", help=argparse.SUPPRESS)
+    parser.add_argument("--file", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.job:
+        job = make if options.job == "make" else JOBS[options.job]
+        arguments = (options.file, options.anchors) if options.job == "make" else (options.file,)
+        print(json.dumps(job(*arguments)))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "made.cgs"
+        child("make", path, options.anchors)
+        results = {job: child(job, path, options.anchors) for job in JOBS}
+        empty = {"NUMBA_CACHE_DIR": str(Path(folder) / "cache")}
+        results["compiling decode"] = child("decode", path, options.anchors, empty)
+        results["compiling encode"] = child("encode", path, options.anchors, empty)
+    results["machine"] = {"cores": os.cpu_count(), "python": platform.python_version()}
+    report(results)
+    if options.output:
+        options.output.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+
+
+def report(results: dict[str, Any]) -> None:
+    p, c = results["parts"], results["constriction"]
+    millions = p["symbols"] / 1e6
+    print(f"{p['anchors']} anchors, {p['coupled']} coupled, {millions:.1f} M symbols, {p['bytes']} bytes")
+    print("\n| | first call, compiling | cold | warm | M symbols/s | peak MB | of it before |")
+    print("|---|---|---|---|---|---|---|")
+    for job in ("encode", "decode"):
+        r = results[job]
+        compiling = results[f"compiling {job}"]["cold_s"]
+        print(
+            f"| {job} | {compiling:.1f} s | {r['cold_s']:.2f} s | {r['warm_s']:.2f} s | "
+            f"{millions / r['warm_s']:.1f} | {r['peak_mb']:.0f} | {r['peak_before_mb']:.0f} |"
+        )
+    print("\n| part | seconds |\n|---|---|")
+    for name, value in p["seconds"].items():
+        print(f"| {name} | {value:.3f} |")
+    print(f"\nentropy coding: {p['overhead_percent']:.3f} % above the cross-entropy of the integer tables")
+    print("\n| coder | bytes | encode M symbols/s | decode M symbols/s | encode ratio | decode ratio |")
+    print("|---|---|---|---|---|---|")
+    theirs = c["constriction"]
+    for name in ("constriction", *(k for k in c if k.endswith("threads"))):
+        r = c[name]
+        print(
+            f"| {name} | {r['bytes']:.0f} | {c['symbols'] / r['encode_s'] / 1e6:.1f} | "
+            f"{c['symbols'] / r['decode_s'] / 1e6:.1f} | {theirs['encode_s'] / r['encode_s']:.1f} | "
+            f"{theirs['decode_s'] / r['decode_s']:.1f} |"
+        )
+    print("\n| section | bytes | bits per anchor |\n|---|---|---|")
+    for name, value in p["sections"].items():
+        print(f"| {name} | {value} | {8 * value / p['anchors']:.3f} |")
+
+
+if __name__ == "__main__":
+    main()
