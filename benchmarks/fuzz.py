@@ -2,10 +2,10 @@
 
     python benchmarks/fuzz.py [--seconds 60] [--seed 0] [FILE ...]
 
-Every file must be refused with a BitstreamError, or, where the forger made its checksums right again, be a
-content that can be written. Anything else (another exception, a crash, seconds of work for a few kilobytes) is a
-failure; the offending file is kept as `fuzz-SEED-NUMBER.cgs`. If the process itself dies, the file that killed it
-is `fuzz-last.cgs`.
+Every file must be refused with a BitstreamError or, where the forger made its checksums right again, be a
+content that can be written. Anything else (another exception, seconds of work for a few kilobytes) is a failure;
+the offending file is kept as `fuzz-SEED-NUMBER.cgs`. If the process itself dies, the file that killed it is
+`fuzz-last.cgs`.
 """
 
 import argparse
@@ -162,9 +162,8 @@ def main() -> None:
     for (kind, result), count in sorted(counts.items()):
         print(f"{kind:16} {result:40} {count}")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(
-        f"{sum(counts.values())} files, {failures} failures, slowest {slowest:.2f} s, peak memory {peak:.0f} MiB"
-    )
+    total = sum(counts.values())
+    print(f"{total} files, {failures} failures, slowest {slowest:.2f} s, peak memory {peak:.0f} MiB")
     sys.exit(1 if failures else 0)
 
 

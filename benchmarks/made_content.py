@@ -18,12 +18,12 @@ def make_content(
     *,
     kept: float = 0.8,  # share of coupled primitives that exist
     hidden: int = 0,  # width of the entropy networks' hidden layer; 0: none
-    symbols: bool = True,  # False: zero symbols, as in a scene without detail
+    symbols: bool = True,  # False: zero symbols, and networks that are sure of it
 ) -> FileContent:
     """Content whose symbols follow its own networks' predictions, as a trained model's do."""
     d = dimensions or Dimensions()
     rng = np.random.default_rng(seed)
-    networks = {name: _network(rng, *size, hidden) for name, size in d.network_sizes().items()}
+    networks = {name: _network(rng, *size, hidden, symbols) for name, size in d.network_sizes().items()}
 
     def hyper(channels: int) -> np.ndarray:
         spread = np.linspace(0.5, 6.0, channels)
@@ -83,7 +83,9 @@ def make_coordinates(anchors: int, rng: np.random.Generator) -> np.ndarray:  # [
     return np.ascontiguousarray(found[rng.permutation(len(found))[:anchors]])
 
 
-def _network(rng: np.random.Generator, inputs: int, outputs: int, hidden: int) -> IntegerNetwork:
+def _network(
+    rng: np.random.Generator, inputs: int, outputs: int, hidden: int, spread: bool
+) -> IntegerNetwork:
     """Means within a few steps, scales between a quarter of a step and a few steps."""
     layers = []
     if hidden:
@@ -92,7 +94,8 @@ def _network(rng: np.random.Generator, inputs: int, outputs: int, hidden: int) -
         inputs = hidden
     channels = outputs // 2
     weight = rng.standard_normal((outputs, inputs)) / np.sqrt(inputs) * 0.3
-    bias = np.concatenate([rng.uniform(-1, 1, channels), rng.uniform(36, 72, channels)])
+    bias = np.concatenate([rng.uniform(-1, 1, channels), rng.uniform(36, 72, channels) * spread])
+    weight[channels:] *= spread
     layers.append(_layer(weight, bias, rectify=False))
     return IntegerNetwork(tuple(layers))
 

@@ -2,7 +2,7 @@
 
     python tools/make_golden_files.py
 
-Run it when the version of the format rises, and only then: a decoder must read golden files of its version for ever.
+Run it when the version of the format rises, and only then: golden files of a version decode for ever.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ from compgs.codec.writer import write_content
 ROOT = Path(__file__).parent.parent
 GOLDEN = ROOT / "tests" / "golden"
 sys.path.append(str(ROOT / "benchmarks"))
-from made_content import make_content
+from made_content import make_content  # noqa: E402
 
 SYMBOLS = ("coordinates", "mask", "reference_hyper", "reference", "covariance", "residual_hyper", "residual")
 LATENTS = ("reference", "covariance", "residual")

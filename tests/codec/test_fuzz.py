@@ -1,0 +1,65 @@
+"""Damaged and forged files: a short run of benchmarks/fuzz.py, and files that promise more than they hold."""
+
+import struct
+import sys
+import tracemalloc
+from itertools import islice
+from pathlib import Path
+
+import pytest
+
+from compgs.codec.format import SCENE, Section, pack, unpack
+from compgs.codec.reader import read_content
+from compgs.codec.sections import SCENE_LAYOUT
+from compgs.codec.writer import write_content
+from compgs.errors import BitstreamError, CorruptSection
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from fuzz import FORGERS, GOLDEN, forgeries, outcome
+from made_content import make_content
+
+MEMORY_FLOOR = 48 << 20  # what any file may take, for its 2^20 free symbols
+MEMORY_PER_BYTE = 4096
+
+
+@pytest.fixture(scope="module")
+def golden() -> list[bytes]:
+    return [path.read_bytes() for path in sorted(GOLDEN.glob("*.cgs"))]
+
+
+def test_forgeries_are_refused_or_sound(golden: list[bytes]) -> None:
+    seen = set()
+    for kind, data in islice(forgeries(golden, seed=1), 700):
+        seen.add((kind, outcome(data)))
+    assert {kind for kind, _ in seen} == {forger.__name__ for forger in FORGERS}
+    assert {kind for kind, result in seen if result == "accepted"} <= {
+        "forged_payload", "forged_scene", "forged_header", "spliced", "flipped",
+    }  # fmt: skip
+
+
+def test_flipped_bits_are_always_caught(golden: list[bytes]) -> None:
+    data = golden[0]
+    for i in range(0, 8 * len(data), 23):
+        broken = bytearray(data)
+        broken[i // 8] ^= 1 << i % 8
+        with pytest.raises(BitstreamError):
+            read_content(bytes(broken))
+
+
+@pytest.mark.parametrize("anchors", [1 << 24, 200_000, 9_000])
+@pytest.mark.parametrize("coupled", [1, 10, 64])
+def test_memory_stays_proportional_to_the_file(anchors: int, coupled: int) -> None:
+    sections = unpack(write_content(make_content(30, 1)))
+    fields = list(struct.unpack(SCENE_LAYOUT, sections[0].data))
+    fields[0], fields[1], fields[2] = anchors, anchors * coupled, coupled
+    assert sections[0].number == SCENE
+    sections[0] = Section(SCENE, struct.pack(SCENE_LAYOUT, *fields))
+    data = pack(sections)
+    tracemalloc.start()
+    try:
+        with pytest.raises(CorruptSection):
+            read_content(data)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < MEMORY_FLOOR + MEMORY_PER_BYTE * len(data)
