@@ -215,16 +215,15 @@ def read_points_binary(file: Path) -> ColmapPoints:
     track_length, head, size = _COUNT.unpack_from, _POINT.itemsize, len(data.data)
     position = data.position
     for index in range(count):
+        if position + head > size:
+            raise SceneError(
+                f"{file}: the file promises {count} points, but it ends inside point {index}: it is "
+                f"truncated; copy or export it again"
+            )
         starts[index] = position
         position += head
-        if position > size:
-            break
         position += 8 * track_length(data.data, position - 8)[0]
-    if position > size:
-        raise SceneError(
-            f"{file}: the file promises {count} points, but it ends inside point {index}: it is truncated; "
-            f"copy or export it again"
-        )
+    data.need(position - data.position, "the track of the last point")
     octets = np.frombuffer(data.data, dtype=np.uint8)
     records = octets[starts[:, None] + np.arange(head)].view(_POINT).reshape(count)
     return ColmapPoints(records["id"], records["xyz"], records["rgb"], records["error"])
@@ -279,6 +278,8 @@ def read_points_text(file: Path) -> ColmapPoints:
             positions.append((float(fields[1]), float(fields[2]), float(fields[3])))
             colors.append((int(fields[4]), int(fields[5]), int(fields[6])))
             errors.append(float(fields[7]))
+            if not 0 <= ids[-1] < 1 << 64:
+                raise ValueError(f"the id {ids[-1]} is outside 0 to 2^64")
             if not 0 <= min(colors[-1]) <= max(colors[-1]) <= 255:
                 raise ValueError(f"a color of {colors[-1]} is outside 0 to 255")
     return ColmapPoints(

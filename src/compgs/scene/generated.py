@@ -76,7 +76,7 @@ def _write_scene(
 
 
 def still_life(rng: np.random.Generator) -> rt.Solids:
-    """Spheres, boxes and cylinders on a tiled ground in front of a landscape, a little different for each seed."""
+    """Spheres, boxes and cylinders on tiles in front of a landscape, a little different for each seed."""
     cream, slate = (0.78, 0.71, 0.58), (0.16, 0.2, 0.27)
     rows: list[tuple[int, tuple, tuple, int, tuple, tuple, float]] = [
         # kind, center, size, texture, its two colors, gloss

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from compgs.cameras import Camera
-from compgs.errors import SceneError, UnreadableImage
+from compgs.errors import SceneError, UnreadableImage, UnsupportedCamera
 from compgs.scene.capture import PosedImage
 from compgs.scene.undistort import sample_bicubic, undistorted_camera, undistortion_map
 from compgs.scene.views import View
@@ -127,7 +127,10 @@ class _Maps:
         key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, posed.distortion)
         with self.lock:
             if key not in self.known:
-                target = undistorted_camera(camera, posed.distortion)
+                try:
+                    target = undistorted_camera(camera, posed.distortion)
+                except UnsupportedCamera as error:
+                    raise UnsupportedCamera(f"{posed.path}: {error}") from error
                 self.known[key] = target, undistortion_map(camera, target, posed.distortion)
             target, positions = self.known[key]
         return replace(target, world_to_camera=camera.world_to_camera), positions
@@ -152,7 +155,7 @@ def _in_threads(work: Callable[[int], _Result], count: int, progress: Progress |
             raise
     if errors:
         first = errors[min(errors)]
-        raise type(first)(f"{first}{_more(len(errors) - 1, 'unreadable')}") from first
+        raise type(first)(f"{first}{_more(len(errors) - 1, 'affected')}") from first
     return [results[index] for index in range(count)]
 
 

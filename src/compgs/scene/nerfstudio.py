@@ -9,6 +9,7 @@ from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
 from compgs.scene.capture import Capture, PosedImage, check_camera
 from compgs.scene.images import image_size
+from compgs.scene.ply_points import read_ply_points
 from compgs.scene.transforms import file_path, number, read_transforms, world_to_camera
 from compgs.scene.undistort import Distortion
 from compgs.scene.views import Points
@@ -37,8 +38,14 @@ def read_nerfstudio(folder: Path) -> Capture:
         posed.append(_posed_image(relative, folder / relative, {**shared, **frame}, place))
     if not posed:
         raise SceneError(f"{file}: no frames; expected at least two views")
-    nothing = Points(np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.uint8))
-    return Capture(tuple(posed), None, nothing, str(file), (0.0, 0.0, 0.0))
+    return Capture(tuple(posed), None, _points(folder, values), str(file), (0.0, 0.0, 0.0))
+
+
+def _points(folder: Path, values: dict[str, Any]) -> Points:
+    ply = values.get("ply_file_path")
+    if isinstance(ply, str) and (folder / ply).is_file():
+        return read_ply_points(folder / ply)
+    return Points(np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.uint8))
 
 
 def _posed_image(name: str, path: Path, values: dict[str, Any], place: str) -> PosedImage:

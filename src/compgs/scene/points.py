@@ -10,6 +10,7 @@ from compgs.errors import ConfigError
 from compgs.scene.views import Points
 
 MIN_POINTS = 100  # with fewer, structure from motion says too little of the scene to start from
+MAX_STRAYS = 0.01  # share of the points that may be too far away for the grid
 COORDINATE_BITS = 21  # signed range of a coordinate: what the position coder represents
 
 
@@ -17,8 +18,8 @@ def voxel_grid(points: Points, voxel_size: float | None = None) -> tuple[np.ndar
     """([N, 3] int32 unique coordinates in voxels, voxel size in world units): one voxel for all points in it.
 
     coordinate = round(position / voxel size) (CompGS Sec. 3.4). Without a voxel size it is the points' median
-    distance to their nearest neighbour (`median_spacing`). Raises ConfigError where coordinates would leave
-    their range.
+    """([N, 3] int32 unique coordinates in voxels, voxel size in world units): one voxel for the points in it.
+    they are few, as wrong triangulations are. Raises ConfigError where coordinates would leave their range.
     """
     positions = points.positions.astype(np.float64)
     size = median_spacing(positions) if voxel_size is None else float(voxel_size)
@@ -26,18 +27,16 @@ def voxel_grid(points: Points, voxel_size: float | None = None) -> tuple[np.ndar
         raise ConfigError(f"voxel size {size}: expected above 0 and finite")
     scaled = np.round(positions / size)
     limit = (1 << (COORDINATE_BITS - 1)) - 1
-    largest = float(np.abs(scaled).max(initial=0.0))
-    if voxel_size is None and largest > limit:
-        # a few points very far away: the grid becomes as coarse as they need
-        size *= largest / limit * (1 + 1e-6)
-        scaled = np.round(positions / size)
-    elif largest > limit:
+    inside = (np.abs(scaled) <= limit).all(axis=1)
+    allowed = MAX_STRAYS * len(positions) if voxel_size is None else 0
+    if (~inside).sum() > allowed:
+        reach = float(np.abs(positions).max())
         raise ConfigError(
-            f"voxel size {size:g}: the points reach {np.abs(positions).max():g} world units from the origin, "
-            f"which is {largest:.0f} voxels, but coordinates end at {limit}; use a voxel size of at least "
-            f"{np.abs(positions).max() / limit:.3g}"
+            f"voxel size {size:g}: the points reach {reach:g} world units from the origin, which is "
+            f"{reach / size:.0f} voxels, but coordinates end at {limit}; use a voxel size of at least "
+            f"{reach / limit:.3g}, or move the scene to the origin"
         )
-    return np.unique(scaled.astype(np.int32), axis=0), size
+    return np.unique(scaled[inside].astype(np.int32), axis=0), size
 
 
 def median_spacing(positions: np.ndarray) -> float:  # positions: [P, 3] world units

@@ -96,8 +96,8 @@ def undistorted_camera(camera: Camera, lens: Distortion) -> Camera:
     focal = np.array([camera.fx, camera.fy, camera.fx, camera.fy])
     if full.min() <= 0:
         raise UnsupportedCamera(
-            f"the principal point ({camera.cx:g}, {camera.cy:g}) of a lens with distortion lies outside of its "
-            f"image of {camera.width}x{camera.height} pixels; calibrate again"
+            f"the principal point ({camera.cx:g}, {camera.cy:g}) lies outside of the image of {camera.width}x"
+            f"{camera.height} pixels, which cannot be undistorted; calibrate again"
         )
 
     def largest(sides: np.ndarray, growth: np.ndarray, top: float) -> np.ndarray:
@@ -117,7 +117,7 @@ def undistorted_camera(camera: Camera, lens: Distortion) -> Camera:
         return sides + good * growth
 
     # Sides: distance of the left, top, right, bottom edge from the axis, in undistorted normalized units.
-    # First all four grow together from the axis, then each on its own, until its edge would look past the image.
+    # First all four grow together from the axis, then each on its own, until it would look past the image.
     # At most to twice the distance without a lens: the image of a fisheye lens could be endless.
     sides = largest(np.zeros(4), full / focal, 2.0)
     for side in (0, 2, 1, 3):

@@ -1,0 +1,72 @@
+"""Sparse points of a .ply file: what nerfstudio writes beside its poses."""
+
+from pathlib import Path
+
+import numpy as np
+
+from compgs.errors import SceneError
+from compgs.scene.views import Points
+
+_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_GRAY = 128
+
+
+def read_ply_points(file: Path) -> Points:
+    """Positions and colors (else gray) of the vertices, ascii or binary. Raises SceneError."""
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise SceneError(f"{file}: cannot be read ({error.strerror or error})") from error
+    end = data.find(b"end_header")
+    newline = data.find(b"\n", end)
+    if not data.startswith(b"ply") or end < 0 or newline < 0:
+        raise SceneError(f"{file}: is not a .ply file; export the points again")
+    try:
+        order, count, columns = _header(data[:end].decode("ascii"))
+        body = data[newline + 1 :]
+        if order == "ascii":
+            lines = body.split(b"\n")[:count]
+            table = np.array([line.split()[: len(columns)] for line in lines], dtype=np.float64)
+            rows = {name: table.reshape(count, len(columns))[:, i] for i, (name, _) in enumerate(columns)}
+        else:
+            vertices = np.frombuffer(body, np.dtype([(n, order + t) for n, t in columns]), count)
+            rows = {name: vertices[name] for name, _ in columns}
+        positions = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    except (ValueError, KeyError) as error:
+        raise SceneError(
+            f"{file}: vertices with x, y, z were expected ({error}); export them again"
+        ) from error
+    if all(name in rows for name in ("red", "green", "blue")):
+        colors = np.stack([rows[name] for name in ("red", "green", "blue")], axis=1).astype(np.uint8)
+    else:
+        colors = np.full((count, 3), _GRAY, dtype=np.uint8)
+    finite = np.isfinite(positions).all(axis=1)
+    return Points(positions[finite], colors[finite])
+
+
+def _header(text: str) -> tuple[str, int, list[tuple[str, str]]]:
+    """(byte order or `ascii`, number of vertices, (name, type) of their properties)."""
+    columns: list[tuple[str, str]] = []
+    order, count, element = "", 0, ""
+    for line in text.splitlines():
+        words = line.split()
+        if words[:1] == ["format"]:
+            order = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}[words[1]]
+        elif words[:1] == ["element"]:
+            if not columns and words[1] != "vertex":
+                raise ValueError(f"the first element is {words[1]}")
+            element, count = words[1], int(words[2]) if words[1] == "vertex" else count
+        elif words[:1] == ["property"] and element == "vertex":
+            columns.append((words[-1], _TYPES[words[1]]))
+    if not order or count < 0:
+        raise ValueError("the header is incomplete")
+    return order, count, columns
