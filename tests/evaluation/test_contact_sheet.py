@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from compgs.evaluation.contact_sheet import CELL_WIDTH, MARGIN, contact_sheet
+from compgs.evaluation.contact_sheet import CELL_WIDTH, COLUMN_WIDTH, MARGIN, contact_sheet
 
 
 def flat(height: int, width: int, color: tuple[int, int, int]) -> np.ndarray:
@@ -21,7 +21,7 @@ def test_photograph_is_left_of_its_rendering_and_whole() -> None:
     assert (bottom - top + 1, right - left + 1) == (60, 80)
     other_top, other_bottom, other_left, other_right = places(sheet, (0, 0, 255))
     assert (other_top, other_bottom) == (top, bottom)
-    assert other_left == right + 1 + MARGIN
+    assert other_left == left + COLUMN_WIDTH + MARGIN
     assert other_right - other_left + 1 == 80
 
 

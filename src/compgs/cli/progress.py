@@ -74,7 +74,8 @@ def describe(status: "TrainingStatus") -> str:
 
 def time_left(status: "TrainingStatus") -> str:
     """`4 min 05 s left`."""
-    return f"{duration((status.steps - status.step) * status.seconds_per_step)} left"
+    seconds = round((status.steps - status.step) * status.seconds_per_step)
+    return f"{duration(seconds) if seconds >= 60 else f'{seconds} s'} left"
 
 
 def _counting_lines(what: str) -> Callable[[int, int], None]:

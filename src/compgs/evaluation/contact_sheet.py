@@ -6,6 +6,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 CELL_WIDTH = 480  # pixels, at most; wider images are reduced
+COLUMN_WIDTH = 300  # pixels, at least: a label must fit
 MARGIN = 8  # pixels
 TEXT = 16  # pixels, height of a label
 INK, PAPER = (30, 30, 30), (255, 255, 255)
@@ -20,7 +21,7 @@ def contact_sheet(
     """One row a view: the photograph on the left, the rendering on the right, labels above."""
     font = ImageFont.load_default(TEXT)
     pairs = [(_reduced(photograph), _reduced(rendering)) for photograph, rendering, _, _ in rows]
-    column = max(left.width for left, _ in pairs)
+    column = max(COLUMN_WIDTH, *(left.width for left, _ in pairs))
     label = TEXT + 2 * MARGIN
     width = 2 * column + 3 * MARGIN
     height = label + sum(label + left.height for left, _ in pairs) + MARGIN
