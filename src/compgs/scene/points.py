@@ -18,8 +18,8 @@ def voxel_grid(points: Points, voxel_size: float | None = None) -> tuple[np.ndar
     """([N, 3] int32 unique coordinates in voxels, voxel size in world units): one voxel for all points in it.
 
     coordinate = round(position / voxel size) (CompGS Sec. 3.4). Without a voxel size it is the points' median
-    """([N, 3] int32 unique coordinates in voxels, voxel size in world units): one voxel for the points in it.
-    they are few, as wrong triangulations are. Raises ConfigError where coordinates would leave their range.
+    distance to their nearest neighbour (`median_spacing`); points too far away for such a grid are left out
+    if they are few, as wrong triangulations are. Raises ConfigError if coordinates leave their range.
     """
     positions = points.positions.astype(np.float64)
     size = median_spacing(positions) if voxel_size is None else float(voxel_size)
