@@ -3,9 +3,9 @@
     python benchmarks/fuzz.py [--seconds 60] [--seed 0] [FILE ...]
 
 Every file must be refused with a BitstreamError or, where the forger made its checksums right again, be a
-content that can be written. Anything else (another exception, seconds of work for a few kilobytes) is a failure;
-the offending file is kept as `fuzz-SEED-NUMBER.cgs`. If the process itself dies, the file that killed it is
-`fuzz-last.cgs`.
+content that can be written. Anything else (another exception, seconds of work for a few kilobytes) is a
+failure; the offending file is kept as `fuzz-SEED-NUMBER.cgs`. If the process itself dies, the file that
+killed it is `fuzz-last.cgs`.
 """
 
 import argparse

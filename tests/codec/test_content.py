@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compgs.codec import integer_network
+from compgs.codec.anchor_order import canonical_order
 from compgs.codec.content import Dimensions, FileContent, cross_entropy_bits, dequantize
 from compgs.codec.format import MAX_SYMBOL, PADDING, pack, unpack
 from compgs.codec.integer_network import IntegerNetwork
@@ -89,6 +90,7 @@ def test_any_content_comes_back(anchors: int, seed: int, d: Dimensions, kept: fl
     data = write_content(content)
     read, latents = read_latents(data)
     assert_same(read, content)
+    assert (canonical_order(read.coordinates) == np.arange(anchors)).all()
     assert write_content(read) == data
     again = dequantize(read)
     for name in ("reference", "covariance", "residual"):

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compgs.codec.anchor_order import canonical_order
 from compgs.codec.content import (
     Dimensions,
     FileContent,
@@ -44,7 +43,7 @@ from compgs.codec.rans import decode_symbols
 from compgs.codec.sections import SceneSection, decode_hyper_tables, decode_metadata, decode_scene
 from compgs.codec.tables import FrequencyTables, channel_tables, gaussian_tables
 from compgs.codec.weights import decode_heads, decode_networks
-from compgs.errors import CorruptSection, NotEncodable
+from compgs.errors import CorruptSection
 
 
 @dataclass(frozen=True)
@@ -105,10 +104,6 @@ def read_latents(data: bytes) -> tuple[FileContent, Latents]:
     networks = decode_networks(sections[NETWORKS], SECTION_NAMES[NETWORKS], d.network_sizes())
     heads = decode_heads(sections[HEADS], SECTION_NAMES[HEADS])
     coordinates = decode_positions(sections[POSITIONS], scene.anchors)
-    try:
-        coordinates = np.ascontiguousarray(coordinates[canonical_order(coordinates)])
-    except NotEncodable as error:
-        raise CorruptSection(f"{SECTION_NAMES[POSITIONS]}: {error}") from error
     mask = decode_masks(sections[MASKS], scene.anchors, d.coupled_primitives)
     coupled = int(mask.sum())
     if coupled != scene.coupled:
