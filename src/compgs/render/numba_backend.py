@@ -45,7 +45,7 @@ class Blend(torch.autograd.Function):
         camera: Camera,
         settings: RasterSettings,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        lists, visible = bin_splats(
+        lists = bin_splats(
             means2d=as_array(means2d),
             covariances=as_array(covariances),
             determinants=as_array(determinants),
@@ -74,7 +74,7 @@ class Blend(torch.autograd.Function):
         )
         ctx.lists, ctx.ends, ctx.thresholds = lists, ends, thresholds
         ctx.save_for_backward(image, transmittance, opacities)
-        visible_mask = torch.from_numpy(visible)
+        visible_mask = torch.from_numpy(lists.visible)
         ctx.mark_non_differentiable(visible_mask)
         return image, transmittance, visible_mask
 
@@ -99,11 +99,11 @@ class Blend(torch.autograd.Function):
             moments,
         )
         m = len(opacities)
-        grad_means2d, grad_covariances = image.new_zeros(m, 2), image.new_zeros(m, 3)
-        grad_opacities, grad_colors = image.new_zeros(m), image.new_zeros(m, 3)
+        grad_means2d, grad_covariances = image.new_empty(m, 2), image.new_empty(m, 3)
+        grad_opacities, grad_colors = image.new_empty(m), image.new_empty(m, 3)
         sum_moments(
+            lists.visible,
             lists.packed,
-            lists.order,
             lists.first_slot,
             lists.slots_used,
             lists.slots,

@@ -19,7 +19,7 @@ vectorized, which costs a factor of ten and is silent (a test looks for vector i
 import numpy as np
 from numba import njit, prange
 
-from compgs.render.binning import CHUNKS, EXP2_SCALE, TILE_HEIGHT, TILE_WIDTH, chunk_bounds
+from compgs.render.binning import CHUNKS, EXP2_SCALE, PARAMETERS, TILE_HEIGHT, TILE_WIDTH, chunk_bounds
 
 FASTMATH = {"contract", "reassoc", "nsz", "arcp", "nnan", "ninf"}
 f32 = np.float32
@@ -68,15 +68,17 @@ def blend_forward(packed, starts, entries, background, cutoff, cap, stop, image,
         left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
         x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
         s = np.zeros(FORWARD_SCRATCH, np.float32)
+        splats = np.empty((ENTRIES_PER_CHECK, PARAMETERS), np.float32)
         start_transmittance(s, left, top, width, height)
         k, end = starts[tile], starts[tile + 1]
         while k < end:
             check = min(k + ENTRIES_PER_CHECK, end)
+            gather_splats(packed, entries, k, check, splats)
             for e in range(k, check):
-                i = entries[e, 0]
-                x, y = packed[i, 0] - x_origin, packed[i, 1] - y_origin
-                l00, l10, l11, log2_opacity = packed[i, 2], packed[i, 3], packed[i, 4], packed[i, 5]
-                red, green, blue = packed[i, 6], packed[i, 7], packed[i, 8]
+                j = e - k
+                x, y = splats[j, 0] - x_origin, splats[j, 1] - y_origin
+                l00, l10, l11, log2_opacity = splats[j, 2], splats[j, 3], splats[j, 4], splats[j, 5]
+                red, green, blue = splats[j, 6], splats[j, 7], splats[j, 8]
                 first = (entries[e, 1] >> 8) // ROWS_PER_VECTOR
                 last = (entries[e, 1] & 255) // ROWS_PER_VECTOR
                 for vector in range(first, last + 1):
@@ -115,6 +117,15 @@ def blend_forward(packed, starts, entries, background, cutoff, cap, stop, image,
 
 
 @njit(inline="always")
+def gather_splats(packed, entries, begin, end, splats):
+    """Copies the splats of some entries side by side: their cache misses overlap instead of adding up."""
+    for e in range(begin, end):
+        i = entries[e, 0]
+        for parameter in range(PARAMETERS):
+            splats[e - begin, parameter] = packed[i, parameter]
+
+
+@njit(inline="always")
 def start_transmittance(s, left, top, width, height):
     """One inside the image; minus one (finished) for a tile's pixels beyond its edge."""
     columns, rows = width - left, height - top
@@ -150,6 +161,7 @@ def blend_backward(
         left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
         x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
         s = np.zeros(BACKWARD_SCRATCH, np.float32)
+        splats = np.empty((ENTRIES_PER_CHECK, PARAMETERS), np.float32)
         start_transmittance(s, left, top, width, height)
         for row in range(min(TILE_HEIGHT, height - top)):
             for column in range(min(TILE_WIDTH, width - left)):
@@ -163,82 +175,85 @@ def blend_backward(
                     grad_transmittance[top + row, left + column] * transmittance[top + row, left + column]
                 )
                 s[pixel + RED], s[pixel + GREEN], s[pixel + BLUE], s[pixel + BEHIND] = g0, g1, g2, behind
-        for e in range(starts[tile], ends[tile]):
-            i = entries[e, 0]
-            x, y = packed[i, 0] - x_origin, packed[i, 1] - y_origin
-            l00, l10, l11, log2_opacity = packed[i, 2], packed[i, 3], packed[i, 4], packed[i, 5]
-            red, green, blue = packed[i, 6], packed[i, 7], packed[i, 8]
-            first = (entries[e, 1] >> 8) // ROWS_PER_VECTOR
-            last = (entries[e, 1] & 255) // ROWS_PER_VECTOR
-            for lane in range(N_LANES):
-                s[lane + SUM0] = ZERO
-                s[lane + SUM1] = ZERO
-                s[lane + SUM2] = ZERO
-                s[lane + SUM3] = ZERO
-                s[lane + SUM4] = ZERO
-                s[lane + SUM5] = ZERO
-            for vector in range(first, last + 1):
-                dy_first = y - f32(vector * ROWS_PER_VECTOR)
-                base = U(vector) * N_LANES
+        for batch in range(starts[tile], ends[tile], ENTRIES_PER_CHECK):
+            batch_end = min(batch + ENTRIES_PER_CHECK, ends[tile])
+            gather_splats(packed, entries, batch, batch_end, splats)
+            for e in range(batch, batch_end):
+                j = e - batch
+                x, y = splats[j, 0] - x_origin, splats[j, 1] - y_origin
+                l00, l10, l11, log2_opacity = splats[j, 2], splats[j, 3], splats[j, 4], splats[j, 5]
+                red, green, blue = splats[j, 6], splats[j, 7], splats[j, 8]
+                first = (entries[e, 1] >> 8) // ROWS_PER_VECTOR
+                last = (entries[e, 1] & 255) // ROWS_PER_VECTOR
+                for lane in range(N_LANES):
+                    s[lane + SUM0] = ZERO
+                    s[lane + SUM1] = ZERO
+                    s[lane + SUM2] = ZERO
+                    s[lane + SUM3] = ZERO
+                    s[lane + SUM4] = ZERO
+                    s[lane + SUM5] = ZERO
+                for vector in range(first, last + 1):
+                    dy_first = y - f32(vector * ROWS_PER_VECTOR)
+                    base = U(vector) * N_LANES
+                    for lane in range(N_LANES):
+                        dx = x - f32(np.uint32(lane) & LAST_LANE_COLUMN)
+                        dy = dy_first - f32(np.uint32(lane) >> LANE_ROW)
+                        p, r = l00 * dx + l10 * dy, l11 * dy
+                        uncapped = exp2_minus(p * p + (r * r - log2_opacity))
+                        alpha = min(cap, uncapped)
+                        alpha = alpha if alpha >= cutoff else ZERO
+                        t = s[base + lane]
+                        weight = alpha * t
+                        t_next = t - weight
+                        open_ = t_next > stop
+                        weight = weight if open_ else ZERO
+                        s[base + lane] = t_next if open_ else -abs(t)
+                        g0, g1, g2 = s[base + lane + RED], s[base + lane + GREEN], s[base + lane + BLUE]
+                        color_grad = g0 * red + g1 * green + g2 * blue
+                        behind = s[base + lane + BEHIND] - weight * color_grad
+                        s[base + lane + BEHIND] = behind
+                        # Kept pixels only; a capped alpha does not change with the splat.
+                        v = weight * color_grad - alpha * behind / (ONE - alpha)
+                        v = v if open_ else ZERO
+                        v = v if uncapped <= cap else ZERO
+                        s[lane + SUM0] += v
+                        s[lane + SUM1] += v * dy
+                        s[lane + SUM2] += v * dy * dy
+                        s[lane + SUM3] += weight * g0
+                        s[lane + SUM4] += weight * g1
+                        s[lane + SUM5] += weight * g2
+                m0, mx, my, mxx, mxy, myy, m_red, m_green, m_blue = (
+                    ZERO,
+                    ZERO,
+                    ZERO,
+                    ZERO,
+                    ZERO,
+                    ZERO,
+                    ZERO,
+                    ZERO,
+                    ZERO,
+                )
                 for lane in range(N_LANES):
                     dx = x - f32(np.uint32(lane) & LAST_LANE_COLUMN)
-                    dy = dy_first - f32(np.uint32(lane) >> LANE_ROW)
-                    p, r = l00 * dx + l10 * dy, l11 * dy
-                    uncapped = exp2_minus(p * p + (r * r - log2_opacity))
-                    alpha = min(cap, uncapped)
-                    alpha = alpha if alpha >= cutoff else ZERO
-                    t = s[base + lane]
-                    weight = alpha * t
-                    t_next = t - weight
-                    open_ = t_next > stop
-                    weight = weight if open_ else ZERO
-                    s[base + lane] = t_next if open_ else -abs(t)
-                    g0, g1, g2 = s[base + lane + RED], s[base + lane + GREEN], s[base + lane + BLUE]
-                    color_grad = g0 * red + g1 * green + g2 * blue
-                    behind = s[base + lane + BEHIND] - weight * color_grad
-                    s[base + lane + BEHIND] = behind
-                    # Kept pixels only; a capped alpha does not change with the splat.
-                    v = weight * color_grad - alpha * behind / (ONE - alpha)
-                    v = v if open_ else ZERO
-                    v = v if uncapped <= cap else ZERO
-                    s[lane + SUM0] += v
-                    s[lane + SUM1] += v * dy
-                    s[lane + SUM2] += v * dy * dy
-                    s[lane + SUM3] += weight * g0
-                    s[lane + SUM4] += weight * g1
-                    s[lane + SUM5] += weight * g2
-            m0, mx, my, mxx, mxy, myy, m_red, m_green, m_blue = (
-                ZERO,
-                ZERO,
-                ZERO,
-                ZERO,
-                ZERO,
-                ZERO,
-                ZERO,
-                ZERO,
-                ZERO,
-            )
-            for lane in range(N_LANES):
-                dx = x - f32(np.uint32(lane) & LAST_LANE_COLUMN)
-                v, v_dy = s[lane + SUM0], s[lane + SUM1]
-                m0 += v
-                mx += v * dx
-                my += v_dy
-                mxx += v * dx * dx
-                mxy += v_dy * dx
-                myy += s[lane + SUM2]
-                m_red += s[lane + SUM3]
-                m_green += s[lane + SUM4]
-                m_blue += s[lane + SUM5]
-            moments[e, 0] = m0
-            moments[e, 1] = mx
-            moments[e, 2] = my
-            moments[e, 3] = mxx
-            moments[e, 4] = mxy
-            moments[e, 5] = myy
-            moments[e, 6] = m_red
-            moments[e, 7] = m_green
-            moments[e, 8] = m_blue
+                    v, v_dy = s[lane + SUM0], s[lane + SUM1]
+                    m0 += v
+                    mx += v * dx
+                    my += v_dy
+                    mxx += v * dx * dx
+                    mxy += v_dy * dx
+                    myy += s[lane + SUM2]
+                    m_red += s[lane + SUM3]
+                    m_green += s[lane + SUM4]
+                    m_blue += s[lane + SUM5]
+                moments[e, 0] = m0
+                moments[e, 1] = mx
+                moments[e, 2] = my
+                moments[e, 3] = mxx
+                moments[e, 4] = mxy
+                moments[e, 5] = myy
+                moments[e, 6] = m_red
+                moments[e, 7] = m_green
+                moments[e, 8] = m_blue
         for e in range(ends[tile], starts[tile + 1]):
             for moment in range(MOMENTS):
                 moments[e, moment] = ZERO
@@ -246,17 +261,23 @@ def blend_backward(
 
 @njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
 def sum_moments(
-    packed, order, first_slot, slots_used, slots, moments, opacities,
+    visible, packed, first_slot, slots_used, slots, moments, opacities,
     grad_means, grad_covariances, grad_opacities, grad_colors,
 ):  # fmt: skip
-    """Adds up each splat's tiles, and turns moments into gradients; rows of other Gaussians are untouched.
+    """Adds up each splat's tiles, and turns moments into gradients.
 
     With X = cov^-1 and alpha = opacity exp(-d^T X d / 2): dL/dmean = -X sum(v d), dL/dcov = X sum(v d d^T) X
     / 2.
     """
     for chunk in prange(CHUNKS):
-        begin, end = chunk_bounds(chunk, order.shape[0])
+        begin, end = chunk_bounds(chunk, visible.shape[0])
         for i in range(begin, end):
+            if not visible[i]:
+                grad_means[i, :] = ZERO
+                grad_covariances[i, :] = ZERO
+                grad_opacities[i] = ZERO
+                grad_colors[i, :] = ZERO
+                continue
             m0, mx, my, mxx, mxy, myy, red, green, blue = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
             for slot in range(first_slot[i], first_slot[i] + slots_used[i]):
                 e = slots[slot]
@@ -269,19 +290,18 @@ def sum_moments(
                 red += moments[e, 6]
                 green += moments[e, 7]
                 blue += moments[e, 8]
-            g = order[i]
             # X = L L^T, with the scale of the packed factor taken out
             l00, l10, l11 = packed[i, 2] / EXP2_SCALE, packed[i, 3] / EXP2_SCALE, packed[i, 4] / EXP2_SCALE
             # moments in whitened coordinates w = L^T d first: fewer digits cancel for long thin splats
             wx, wy = l00 * mx + l10 * my, l11 * my
             wxx = l00 * l00 * mxx + f32(2) * l00 * l10 * mxy + l10 * l10 * myy
             wxy, wyy = l11 * (l00 * mxy + l10 * myy), l11 * l11 * myy
-            grad_means[g, 0] = -l00 * wx
-            grad_means[g, 1] = -(l10 * wx + l11 * wy)
-            grad_covariances[g, 0] = HALF * l00 * l00 * wxx
-            grad_covariances[g, 1] = l00 * (l10 * wxx + l11 * wxy)
-            grad_covariances[g, 2] = HALF * (l10 * l10 * wxx + f32(2) * l10 * l11 * wxy + l11 * l11 * wyy)
-            grad_opacities[g] = m0 / opacities[g]
-            grad_colors[g, 0] = red
-            grad_colors[g, 1] = green
-            grad_colors[g, 2] = blue
+            grad_means[i, 0] = -l00 * wx
+            grad_means[i, 1] = -(l10 * wx + l11 * wy)
+            grad_covariances[i, 0] = HALF * l00 * l00 * wxx
+            grad_covariances[i, 1] = l00 * (l10 * wxx + l11 * wxy)
+            grad_covariances[i, 2] = HALF * (l10 * l10 * wxx + f32(2) * l10 * l11 * wxy + l11 * l11 * wyy)
+            grad_opacities[i] = m0 / opacities[i]
+            grad_colors[i, 0] = red
+            grad_colors[i, 1] = green
+            grad_colors[i, 2] = blue
