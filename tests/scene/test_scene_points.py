@@ -76,10 +76,11 @@ def test_a_voxel_size_that_leaves_the_range_is_refused_with_one_that_fits() -> N
 def test_a_few_points_beyond_the_range_are_left_out() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(6) * 1e-3] * 3), axis=-1).reshape(-1, 3)
     far = np.concatenate([grid, [[1e5, 0, 0]]])
-    coordinates, size = voxel_grid(points_at(far))
-    assert size == pytest.approx(1e-3)
-    assert len(coordinates) == len(grid)
-    assert np.abs(coordinates).max() < 1 << (COORDINATE_BITS - 1)
+    for chosen in (None, 1e-3):
+        coordinates, size = voxel_grid(points_at(far), chosen)
+        assert size == pytest.approx(1e-3)
+        assert len(coordinates) == len(grid)
+        assert np.abs(coordinates).max() < 1 << (COORDINATE_BITS - 1)
 
 
 def test_a_scene_far_from_the_origin_is_refused() -> None:

@@ -18,8 +18,8 @@ def voxel_grid(points: Points, voxel_size: float | None = None) -> tuple[np.ndar
     """([N, 3] int32 unique coordinates in voxels, voxel size in world units): one voxel for all points in it.
 
     coordinate = round(position / voxel size) (CompGS Sec. 3.4). Without a voxel size it is the points' median
-    distance to their nearest neighbour (`median_spacing`); points too far away for such a grid are left out
-    if they are few, as wrong triangulations are. Raises ConfigError if coordinates leave their range.
+    distance to their nearest neighbour (`median_spacing`). Points beyond the range of coordinates are left
+    out if they are few, as wrong triangulations are; else raises ConfigError.
     """
     positions = points.positions.astype(np.float64)
     size = median_spacing(positions) if voxel_size is None else float(voxel_size)
@@ -28,8 +28,7 @@ def voxel_grid(points: Points, voxel_size: float | None = None) -> tuple[np.ndar
     scaled = np.round(positions / size)
     limit = (1 << (COORDINATE_BITS - 1)) - 1
     inside = (np.abs(scaled) <= limit).all(axis=1)
-    allowed = MAX_STRAYS * len(positions) if voxel_size is None else 0
-    if (~inside).sum() > allowed:
+    if (~inside).sum() > MAX_STRAYS * len(positions):
         reach = float(np.abs(positions).max())
         raise ConfigError(
             f"voxel size {size:g}: the points reach {reach:g} world units from the origin, which is "
