@@ -82,7 +82,7 @@ class _FusedPhotometric(torch.autograd.Function):
 
 def scale_regularizer(scales: Tensor) -> Tensor:
     """Mean product of the three scales, [M, 3] world units: large primitives are expensive to render."""
-    return scales.prod(1).mean()
+    return scales.prod(1).sum() / max(1, len(scales))  # (a view may see none)
 
 
 def rate(bits: Mapping[str, Tensor], elements: Mapping[str, int], normalization: str) -> Tensor:

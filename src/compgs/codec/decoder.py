@@ -51,9 +51,13 @@ def from_latents(content: FileContent, latents: Latents, device: torch.device) -
                 raise CorruptSection(
                     f"prediction heads: {name} has shape {tensor.values.shape}, expected {tuple(parameter.shape)}"
                 )
-            parameter.copy_(torch.from_numpy(tensor.values.astype(np.float32) * np.float32(2.0**-tensor.exponent)))
+            parameter.copy_(
+                torch.from_numpy(tensor.values.astype(np.float32) * np.float32(2.0**-tensor.exponent))
+            )
     primitives = Primitives(
-        positions=torch.from_numpy(content.coordinates.astype(np.float32) * np.float32(content.voxel_size)).to(device),
+        positions=torch.from_numpy(
+            content.coordinates.astype(np.float32) * np.float32(content.voxel_size)
+        ).to(device),
         log_scales=floats(latents.covariance, content.covariance_step),
         references=floats(latents.reference, content.reference_step),
         residuals=floats(latents.residual, content.residual_step),
@@ -63,5 +67,3 @@ def from_latents(content: FileContent, latents: Latents, device: torch.device) -
     return HybridModel(
         primitives, heads.requires_grad_(False).to(device), content.view_distance_scale, content.background
     )
-
-

@@ -108,8 +108,12 @@ def to_content(model: TrainedModel) -> FileContent:
         covariance=q_c,
         residual_hyper=z_g,
         residual=residual,
-        reference_hyper_tables=hyper_tables(entropy.reference_density.probabilities().double().cpu().numpy(), z_f),
-        residual_hyper_tables=hyper_tables(entropy.residual_density.probabilities().double().cpu().numpy(), z_g),
+        reference_hyper_tables=hyper_tables(
+            entropy.reference_density.probabilities().double().cpu().numpy(), z_f
+        ),
+        residual_hyper_tables=hyper_tables(
+            entropy.residual_density.probabilities().double().cpu().numpy(), z_g
+        ),
         networks=networks,
         heads=tuple(
             (name, quantized_tensor(p, e.head_bits if p.dim() > 1 else BIAS_BITS))
@@ -139,7 +143,9 @@ def integer_network(network: EntropyNetwork, bits: int) -> IntegerNetwork:
 def quantized_tensor(parameter: Tensor, bits: int) -> QuantizedTensor:
     """A prediction network's parameter as the file holds it."""
     exponent = weight_exponent(parameter, bits)
-    return QuantizedTensor(_symbols(parameter.detach().double() * 2.0**exponent, (1 << (bits - 1)) - 1), exponent)
+    return QuantizedTensor(
+        _symbols(parameter.detach().double() * 2.0**exponent, (1 << (bits - 1)) - 1), exponent
+    )
 
 
 def _symbols(x: Tensor, limit: int = (1 << 31) - 1) -> np.ndarray:
