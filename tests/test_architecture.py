@@ -129,3 +129,10 @@ def test_from_bytes_to_symbols_no_torch_is_loaded(module: str) -> None:
 def test_public_names_exist() -> None:
     for name in compgs.__all__:
         assert getattr(compgs, name) is not None
+
+
+def test_public_functions_stay_functions_whatever_was_imported() -> None:
+    parts = sorted(p.name for p in SOURCE.iterdir() if (p / "__init__.py").is_file())
+    names = [name for name in compgs.__all__ if name[0].islower()]
+    loaded = "; ".join(f"import compgs.{part}" for part in parts)
+    modules_after(f"{loaded}; assert all(callable(getattr(compgs, name)) for name in {names})")

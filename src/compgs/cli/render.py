@@ -121,7 +121,7 @@ class Render(ComputingCommand, SceneOptions, FileArgument):
 
     def render(self, model: "HybridModel", views: "Sequence[tuple[str, Camera]]") -> None:
         from compgs.evaluation.camera_path import camera_entry
-        from compgs.evaluation.evaluate import encode_png, timed_render
+        from compgs.evaluation.measure import encode_png, timed_render
 
         times: list[float] = []
         with counting("rendering") as progress:

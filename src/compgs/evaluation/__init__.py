@@ -1,7 +1,7 @@
 """Evaluation: a decoded file against held-out views; rate-distortion curves (CompGS Sec. 4)."""
 
 from compgs.evaluation.bd_rate import bd_rate
-from compgs.evaluation.evaluate import evaluate
+from compgs.evaluation.measure import evaluate
 from compgs.evaluation.results import Results, ViewResult
 
 __all__ = ["Results", "ViewResult", "bd_rate", "evaluate"]

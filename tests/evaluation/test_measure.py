@@ -1,6 +1,5 @@
 """Evaluation measures what a file decodes to, and writes down exactly that."""
 
-import importlib
 import json
 import math
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from compgs.cameras import Camera
 from compgs.errors import OutputError, SceneError
 from compgs.evaluation import evaluate as package_evaluate
 from compgs.evaluation.camera_path import read_cameras
-from compgs.evaluation.evaluate import evaluate
+from compgs.evaluation.measure import evaluate
 from compgs.scene.views import Points, Scene, View
 
 
@@ -50,14 +49,14 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "flat.cgs"
     path.write_bytes(b"x" * 1000)
     sections = (SimpleNamespace(name="positions", bytes=300), SimpleNamespace(name="weights", bytes=700))
-    module = importlib.import_module("compgs.evaluation.evaluate")
+    module = "compgs.evaluation.measure"
 
     def render(model: StandIn, camera: Camera) -> SimpleNamespace:
         return SimpleNamespace(image=torch.full((camera.height, camera.width, 3), model.level))
 
-    monkeypatch.setattr(module, "decode", lambda path, device: StandIn(100 / 255))
-    monkeypatch.setattr(module, "file_info", lambda data: SimpleNamespace(sections=sections))
-    monkeypatch.setattr(module, "render", render)
+    monkeypatch.setattr(f"{module}.decode", lambda path, device: StandIn(100 / 255))
+    monkeypatch.setattr(f"{module}.file_info", lambda data: SimpleNamespace(sections=sections))
+    monkeypatch.setattr(f"{module}.render", render)
     return path
 
 
