@@ -1,13 +1,13 @@
 """Which splats touch which tiles, in depth order (CPU).
 
-    splats ──box meets image──► visible ──┬──ellipse against columns──► slots: tile and rows, splat by splat ─┐
-                                          └──radix sort──► depth order ───────────────────────────────────────┴► entries
+    box meets image? ──► visible ─┬─ ellipse against columns ──► slots (a splat's tiles, rows) ─┐
+                                  └─ radix sort ──► depth order ────────────────────────────────┴──► entries
 
 One depth sort; a stable counting sort by tile then leaves every tile's entries in depth order. An image
 column of TILE_WIDTH pixels is cut by a splat's ellipse in an interval of rows that is known in closed form,
-so a tile's entry holds exactly the rows in which alpha may reach the cutoff. All that is computed per splat is
-computed, and stays, in the order of the input, whose neighbours are mostly neighbours in the image. Work is
-cut into CHUNKS pieces whatever the number of threads.
+so a tile's entry holds exactly the rows in which alpha may reach the cutoff. All that is computed per splat
+is computed, and stays, in the order of the input, whose neighbours are mostly neighbours in the image. Work
+is cut into CHUNKS pieces whatever the number of threads.
 """
 
 import math
@@ -38,7 +38,7 @@ EXP2_SCALE = f32(math.sqrt(0.5 / math.log(2)))
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """Packed splats, and E entries sorted by tile, front to back within a tile. Rows of invisible splats are unset."""
+    """E entries sorted by tile, front to back within a tile. Rows of invisible splats are not set."""
 
     visible: np.ndarray  # [M] bool
     packed: np.ndarray  # [M, PARAMETERS] float32: mean x, y; Cholesky l00, l10, l11; log2 opacity; R, G, B
@@ -123,7 +123,7 @@ def find_visible(
     found,
     room,
 ):
-    """Fills `visible` [M]; of the visible `boxes` [M, 4] (columns, rows) and log2 opacity; sums over chunks."""
+    """Fills `visible` [M] and, of the visible, `boxes` [M, 4] and log2 opacity; counts for each chunk."""
     for chunk in prange(CHUNKS):
         begin, end = chunk_bounds(chunk, means.shape[0])
         n, tiles = np.int64(0), np.int64(0)
@@ -220,7 +220,7 @@ def gather_keys(visible, depths, found, keys, order):
 
 
 def sort_by_key(keys: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """`order` [S] int32 by key [S] uint32: stable radix sort over the bits in which keys differ, lowest first."""
+    """`order` sorted by `keys` [S] uint32: a stable radix sort over the bits in which keys differ."""
     if len(keys) == 0:
         return order
     lowest = keys.min()

@@ -24,8 +24,10 @@ from compgs.render.settings import RasterSettings, jacobian_limits
 FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 f32 = np.float32
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
-LARGEST = f32(1e9)  # pixels; a splat farther away or wider than this is not drawn (its numbers may overflow)
-LARGEST_AREA = f32(1e30)  # of the determinant, pixels^4
+# A splat beyond these is not drawn: the squares of its numbers may overflow.
+LARGEST_MEAN = f32(1e9)  # pixels
+LARGEST_VARIANCE = f32(1e15)  # pixels^2
+LARGEST_DETERMINANT = f32(1e30)  # pixels^4
 
 # Rows of the scratch buffer. Unsigned indices: with signed ones the loops are not vectorized.
 U = np.uint64
@@ -122,10 +124,9 @@ def project_forward(means, quaternions, scales, k, means2d, covariances, depths,
             c = f10 * f10 + f11 * f11 + f12 * f12
             d01, d02, d12 = f00 * f11 - f01 * f10, f00 * f12 - f02 * f10, f01 * f12 - f02 * f11
             det = d01 * d01 + d02 * d02 + d12 * d12 + dilation * (a + c) + dilation * dilation
-            drawn = (
-                (z >= near) & (det > ZERO) & (det < LARGEST_AREA) & (abs(u) < LARGEST) & (abs(v) < LARGEST)
-            )
-            drawn = drawn & (a < LARGEST) & (c < LARGEST)
+            drawn = (z >= near) & (det > ZERO) & (det < LARGEST_DETERMINANT)
+            drawn = drawn & (abs(u) < LARGEST_MEAN) & (abs(v) < LARGEST_MEAN)
+            drawn = drawn & (a < LARGEST_VARIANCE) & (c < LARGEST_VARIANCE)
             s[i + OUT_U] = u if drawn else ZERO
             s[i + OUT_V] = v if drawn else ZERO
             s[i + OUT_A] = a + dilation if drawn else ONE

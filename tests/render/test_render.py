@@ -1,0 +1,98 @@
+"""The public face of rendering."""
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import compgs
+from compgs.cameras import Camera
+from compgs.errors import ConfigError, MissingDependency
+from compgs.gaussians import Gaussians
+from compgs.render import RasterSettings, rasterize, render
+from compgs.render.gsplat_backend import check_settings, load_gsplat
+
+CAMERA = Camera(np.eye(4), 30.0, 30.0, 10.0, 8.0, 20, 16)
+
+
+def make_gaussians(count: int) -> Gaussians:
+    g = torch.Generator().manual_seed(0)
+    means = torch.randn(count, 3, generator=g) + torch.tensor([0.0, 0.0, 3.0])
+    opacities = torch.rand(count, generator=g)
+    colors = torch.nn.Parameter(torch.rand(count, 3, generator=g))
+    return Gaussians(
+        means, torch.randn(count, 4, generator=g), torch.full((count, 3), 0.2), opacities, colors
+    )
+
+
+class PlainModel:
+    background = (0.1, 0.6, 0.3)
+
+    def gaussians(self, camera: Camera) -> Gaussians:
+        return make_gaussians(50)
+
+
+class BoundedModel:
+    """Anchors in and out of view; draws the ones it is asked for."""
+
+    background = (0.0, 0.0, 0.0)
+    bounds = (torch.tensor([[0.0, 0, 3], [0, 0, -3]]), torch.tensor([0.7, 0.7]))
+    asked: torch.Tensor | None = None
+
+    def gaussians(self, camera: Camera, visible: torch.Tensor) -> Gaussians:
+        self.asked = visible
+        return make_gaussians(50)
+
+
+def test_a_model_is_rendered_over_its_background_without_gradients():
+    result = render(PlainModel(), CAMERA)
+    expected = rasterize(PlainModel().gaussians(CAMERA), CAMERA, RasterSettings(PlainModel.background))
+    assert result.image.shape == (16, 20, 3)
+    assert torch.equal(result.image, expected.image.detach())
+    assert not result.image.requires_grad
+
+
+def test_settings_replace_the_defaults():
+    result = render(PlainModel(), CAMERA, RasterSettings(background=(1.0, 1.0, 1.0), near_plane=1e6))
+    assert torch.all(result.image == 1)
+
+
+def test_a_model_with_bounds_is_asked_for_anchors_in_view_only():
+    model = BoundedModel()
+    render(model, CAMERA)
+    assert model.asked is not None and model.asked.tolist() == [True, False]
+
+
+def test_the_package_itself_renders():
+    # a package and a function share the name: whichever was bound last, it can be called
+    image = render(PlainModel(), CAMERA).image
+    assert torch.equal(compgs.render(PlainModel(), CAMERA).image, image)
+    assert torch.equal(sys.modules["compgs.render"](PlainModel(), camera=CAMERA).image, image)
+
+
+def test_cuda_names_what_is_missing():
+    if torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    with pytest.raises(MissingDependency, match="no CUDA device"):
+        load_gsplat()
+
+
+def test_a_missing_gsplat_names_the_install_line(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(MissingDependency, match=r"pip install 'compgs\[cuda\]'"):
+        load_gsplat()
+
+
+def test_settings_that_gsplat_cannot_obey_are_refused():
+    check_settings(RasterSettings(background=(1.0, 1.0, 1.0), near_plane=0.2, dilation=0.1))
+    for change in (
+        {"alpha_cutoff": 0.01},
+        {"alpha_cap": 0.99},
+        {"transmittance_stop": 1e-3},
+        {"margin": 0.15},
+    ):
+        with pytest.raises(ConfigError, match="on CUDA only background, dilation, near_plane"):
+            check_settings(dataclasses.replace(RasterSettings(), **change))
