@@ -49,7 +49,9 @@ def training() -> Iterator[Callable[["TrainingStatus"], None]]:
         TextColumn("{task.fields[left]}"),
     )
     with Progress(*columns, console=console) as bars:
-        task = bars.add_task("", total=None, left="")
+        task = bars.add_task(
+            "the first steps take longer: kernels are loaded or compiled", total=None, left=""
+        )
 
         def show(status: "TrainingStatus") -> None:
             bars.update(

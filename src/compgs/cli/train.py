@@ -1,5 +1,6 @@
 """`compgs train`: photographs in, one small file out, and proof of what the file is worth."""
 
+import shlex
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -218,4 +219,4 @@ def interrupted(folder: Path) -> str:
     checkpoint = folder / CHECKPOINT_NAME
     if not checkpoint.is_file():
         return "interrupted before the first checkpoint: start again with --overwrite"
-    return f"interrupted; the checkpoint is {checkpoint}\ncontinue with: compgs train -o {folder} --resume"
+    return f"interrupted; the checkpoint is {checkpoint}\ncontinue with: compgs train -o {shlex.quote(str(folder))} --resume"
