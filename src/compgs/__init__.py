@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from compgs.codec import decode, encode
     from compgs.config import load_config
     from compgs.errors import CompGSError
-    from compgs.evaluation import evaluate
+    from compgs.evaluation import evaluate as evaluate
     from compgs.gaussians import Gaussians
     from compgs.render import render
     from compgs.scene import load_scene

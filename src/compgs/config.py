@@ -24,8 +24,12 @@ class ModelConfig:
     reference_dim: int = 32  # channels of a reference embedding (Sec. 3.4)
     residual_dim: int = 8  # channels of a residual embedding (Sec. 3.4)
     width: int = 32  # hidden width of the residual MLPs (Ref.)
-    heads: Literal["separate", "paired"] = "paired"  # separate: four networks (Sec. 3.2); paired: geometry, appearance
-    voxel_size: float | None = None  # world units between neighbouring anchors; None: from the points' spacing
+    heads: Literal["separate", "paired"] = (
+        "paired"  # separate: four networks (Sec. 3.2); paired: geometry, appearance
+    )
+    voxel_size: float | None = (
+        None  # world units between neighbouring anchors; None: from the points' spacing
+    )
     voxel_spacings: float = 1.5  # median distances of the points to a voxel, where voxel_size is not given
     max_anchors: int = 1_000_000  # growth stops here
 
@@ -36,7 +40,9 @@ class EntropyConfig:
 
     reference_hyper_dim: int = 4  # hyperprior channels of a reference embedding (Ref.)
     residual_hyper_dim: int = 10  # hyperprior channels of an anchor's K residual embeddings (Ref.)
-    reference_step: float = 0.33  # quantization step of reference embeddings (1 in Sec. 3.4 costs 0.5 dB in short runs)
+    reference_step: float = (
+        0.33  # quantization step of reference embeddings (1 in Sec. 3.4 costs 0.5 dB in short runs)
+    )
     residual_step: float = 0.5  # quantization step of residual embeddings (1 in Sec. 3.4)
     covariance_step: float = 0.05  # initial learned step of the anchors' log scales; 0.01 in the paper starts
     #   on the likelihood floor in short runs
@@ -54,7 +60,9 @@ class ControlConfig:
     every: float = 0.05  # of the steps between two controls, at least twice the number of views
     gradient_threshold: float = 1e-4  # mean norm of the 2D gradient, in units of half the image
     minimum_views: int = 20  # a primitive seen less often is not judged
-    opacity_threshold: float = 5e-4  # anchors with less opacity, summed over K, averaged over views, are removed
+    opacity_threshold: float = (
+        5e-4  # anchors with less opacity, summed over K, averaged over views, are removed
+    )
     growth_probability: float = 0.5  # a candidate of level l is kept with probability p^(l + 1)
 
 
@@ -65,7 +73,9 @@ class TrainingConfig:
     steps: int = 30_000  # one view each
     seed: int = 0
     lmbda: float = 0.001  # weight of the rate
-    rate: Literal["bits", "elements"] = "bits"  # bits: true bits, normalized so that lambda means the same as in
+    rate: Literal["bits", "elements"] = (
+        "bits"  # bits: true bits, normalized so that lambda means the same as in
+    )
     #   the paper; elements: sum over the tensors of mean bits per element (Ref.)
     rate_start: float = 0.1  # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
     ssim_weight: float = 0.2  # (1 - w) L1 + w (1 - SSIM) (3DGS)
@@ -77,8 +87,12 @@ class TrainingConfig:
     opacity_lr: tuple[float, float] = (2e-3, 2e-5)  # Ref.
     color_lr: tuple[float, float] = (8e-3, 8e-5)  # Ref.
     entropy_lr: tuple[float, float] = (5e-3, 1e-4)  # Ref. 2e-4 -> 1e-5 hardly moves in short runs
-    quantized_weights: float = 0.8  # of the steps before the networks' weights are trained as they will be stored
-    checkpoint_minutes: float = 5.0  # between two checkpoints; one is also written when the run is interrupted
+    quantized_weights: float = (
+        0.8  # of the steps before the networks' weights are trained as they will be stored
+    )
+    checkpoint_minutes: float = (
+        5.0  # between two checkpoints; one is also written when the run is interrupted
+    )
 
 
 @dataclass(frozen=True)

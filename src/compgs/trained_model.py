@@ -74,15 +74,18 @@ class TrainedModel(nn.Module):
         stored_weights: bool = True,
     ) -> Quantized:
         """Quantized latents (in steps) and their bits; see EntropyModel.forward."""
-        if rows is None:
-            references, log_scales, residuals = self.references, self.log_scales, self.residuals
-        else:
-            references = self.references.index_select(0, rows)
-            log_scales = self.log_scales.index_select(0, rows)
-            residuals = self.residuals.index_select(0, rows)
+
+        def chosen(parameter: Tensor) -> Tensor:
+            return parameter if rows is None else parameter.index_select(0, rows)
+
         bits = self.config.entropy.network_bits if stored_weights else None
         return self.entropy(
-            references, log_scales / self.entropy.covariance_step, residuals, rate=rate, noise=noise, network_bits=bits
+            chosen(self.references),
+            chosen(self.log_scales) / self.entropy.covariance_step,
+            chosen(self.residuals),
+            rate=rate,
+            noise=noise,
+            network_bits=bits,
         )
 
     def primitives(self, latents: Quantized, rows: Tensor | None = None) -> Primitives:
@@ -102,7 +105,8 @@ class TrainedModel(nn.Module):
         """The heads' parameters as the file will hold them, by name, straight-through."""
         bits = self.config.entropy.head_bits
         return {
-            name: quantize_weight(p, bits if p.dim() > 1 else BIAS_BITS) for name, p in self.heads.named_parameters()
+            name: quantize_weight(p, bits if p.dim() > 1 else BIAS_BITS)
+            for name, p in self.heads.named_parameters()
         }
 
     @torch.no_grad()

@@ -65,7 +65,9 @@ def test_prediction_equals_the_equations_written_out(primitives, layout):
     assert torch.equal(result.index, torch.nonzero(drawn).view(-1))
     torch.testing.assert_close(result.gaussians.means, mean[drawn], **close)
     torch.testing.assert_close(result.gaussians.colors, color[drawn], **close)
-    torch.testing.assert_close(result.gaussians.scales, (torch.sigmoid(beta[:, 3:6]) * s[:, 3:])[drawn], **close)
+    torch.testing.assert_close(
+        result.gaussians.scales, (torch.sigmoid(beta[:, 3:6]) * s[:, 3:])[drawn], **close
+    )
 
 
 def test_the_affine_transform_gives_a_covariance_for_any_network_output():
@@ -111,7 +113,10 @@ def test_a_loaded_model_gives_the_gaussians_of_prediction(primitives, layout):
     visible = torch.arange(N) % 2 == 0
     half = model.gaussians(camera, visible)
     torch.testing.assert_close(
-        half.means, predict(net, select_anchors(some, visible), CENTER, 4.0).gaussians.means, atol=1e-5, rtol=1e-4
+        half.means,
+        predict(net, select_anchors(some, visible), CENTER, 4.0).gaussians.means,
+        atol=1e-5,
+        rtol=1e-4,
     )
 
 

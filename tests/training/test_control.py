@@ -34,7 +34,9 @@ def test_the_number_of_anchors_has_a_limit_that_holds(blob_scene, tiny_config):
     trainer.control.config = replace(tiny_config, model=replace(tiny_config.model, max_anchors=limit))
     trainer.control.drawn[:] = 1000
     trainer.control.gradient[:] = 1e6
-    trainer.control.act(trainer.model, trainer.optimizer, trainer.coupled_means() * 2, torch.Generator().manual_seed(0))
+    trainer.control.act(
+        trainer.model, trainer.optimizer, trainer.coupled_means() * 2, torch.Generator().manual_seed(0)
+    )
     assert trainer.model.anchors == limit
 
 

@@ -36,7 +36,7 @@ def from_latents(content: FileContent, latents: Latents, device: torch.device) -
     scale = 2.0**-FRACTION_BITS
 
     def floats(fixed: np.ndarray, step: float) -> torch.Tensor:
-        return torch.from_numpy((fixed.astype(np.float32) * np.float32(scale * step))).to(device)
+        return torch.from_numpy(fixed.astype(np.float32) * np.float32(scale * step)).to(device)
 
     anchor_index, _ = np.nonzero(content.mask)
     heads = PredictionHeads(d.reference_dim, d.residual_dim, d.width, d.heads)

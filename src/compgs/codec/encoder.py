@@ -97,7 +97,7 @@ def to_content(model: TrainedModel) -> FileContent:
         ),
         voxel_size=model.voxel_size,
         view_distance_scale=model.distance_unit,
-        background=tuple(model.background),
+        background=model.background,
         reference_step=e.reference_step,
         residual_step=e.residual_step,
         covariance_step=float(covariance_step),

@@ -49,10 +49,10 @@ class Quantized:
 class EntropyModel(nn.Module):
     """Hyperpriors for the embeddings, the reference as context for everything else (CompGS Sec. 3.3).
 
-        f ──analysis──► z_f ──► (mean, scale) of f
-        f_hat ──► (mean, scale) of c
-        g ──analysis──► z_g ┐
-        f_hat ──────────────┴──► (mean, scale) of g
+    f ──analysis──► z_f ──► (mean, scale) of f
+    f_hat ──► (mean, scale) of c
+    g ──analysis──► z_g ┐
+    f_hat ──────────────┴──► (mean, scale) of g
     """
 
     def __init__(self, model: ModelConfig, entropy: EntropyConfig) -> None:
@@ -63,7 +63,9 @@ class EntropyModel(nn.Module):
         self.reference_density = FactorizedDensity(entropy.reference_hyper_dim)
         self.reference_network = EntropyNetwork(entropy.reference_hyper_dim, model.reference_dim, hidden)
         # Log scales span a few natural units, that is dozens of steps.
-        self.covariance_network = EntropyNetwork(model.reference_dim, 6, hidden, 1.0 / entropy.covariance_step)
+        self.covariance_network = EntropyNetwork(
+            model.reference_dim, 6, hidden, 1.0 / entropy.covariance_step
+        )
         self.residual_analysis = HyperAnalysis(residuals, entropy.residual_hyper_dim)
         self.residual_density = FactorizedDensity(entropy.residual_hyper_dim)
         self.residual_network = EntropyNetwork(

@@ -1,5 +1,6 @@
 """The trainable twin of the codec's integer networks."""
 
+import itertools
 import math
 
 import torch
@@ -34,7 +35,7 @@ class EntropyNetwork(nn.Module):
         self.channels = channels
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
+        for n_in, n_out in itertools.pairwise(sizes):
             bound = 1.0 / math.sqrt(n_in)
             self.weights.append(nn.Parameter(torch.empty(n_out, n_in).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.zeros(n_out)))

@@ -44,12 +44,12 @@ class HybridModel:
         means, scales, quaternions = [], [], []
         with torch.no_grad():
             # In blocks, so that the peak stays near the size of the result.
-            for index, residuals in zip(p.anchor_index.split(1 << 18), p.residuals.split(1 << 18), strict=True):
+            for index, residuals in zip(
+                p.anchor_index.split(1 << 18), p.residuals.split(1 << 18), strict=True
+            ):
                 first, last = (int(index[0]), int(index[-1]) + 1) if len(index) else (0, 0)
                 raw = self.heads("geometry", p.references[first:last], residuals, index - first)
-                m, s, q = affine_transform(
-                    raw, p.positions[index], p.offset_scales[index], p.sizes[index]
-                )
+                m, s, q = affine_transform(raw, p.positions[index], p.offset_scales[index], p.sizes[index])
                 means.append(m)
                 scales.append(s)
                 quaternions.append(q)
@@ -87,5 +87,9 @@ class HybridModel:
                 color = self.heads("color", seen, residuals[drawn], rows[drawn])
             primitive = chosen[drawn]
             return Gaussians(
-                means[primitive], quaternions[primitive], scales[primitive], opacities[drawn], torch.sigmoid(color)
+                means[primitive],
+                quaternions[primitive],
+                scales[primitive],
+                opacities[drawn],
+                torch.sigmoid(color),
             )

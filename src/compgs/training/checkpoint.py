@@ -94,7 +94,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 def optimizer_tensors(model: TrainedModel, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     """Adam's moments by the names of their parameters."""
-    names = {p: name for name, p in model.named_parameters()}
+    names: dict[Tensor, str] = {p: name for name, p in model.named_parameters()}
     result = {}
     for parameter, state in optimizer.state.items():
         for key, value in state.items():
@@ -102,7 +102,9 @@ def optimizer_tensors(model: TrainedModel, optimizer: torch.optim.Optimizer) -> 
     return result
 
 
-def restore_optimizer(model: TrainedModel, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
+def restore_optimizer(
+    model: TrainedModel, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]
+) -> None:
     """Inverse of `optimizer_tensors`."""
     parameters = dict(model.named_parameters())
     for name, value in tensors.items():

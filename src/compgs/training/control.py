@@ -13,8 +13,8 @@ from torch import Tensor
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
 from compgs.model.prediction import Prediction
-from compgs.training.optimizers import replace_rows
 from compgs.trained_model import TrainedModel
+from compgs.training.optimizers import replace_rows
 
 # (gradient threshold factor, grid size in voxels), coarse first
 GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
@@ -71,7 +71,9 @@ class AdaptiveControl:
         self.opacity[rows] += prediction.opacities.clamp_min(0).view(-1, k).sum(1)
 
     @torch.no_grad()
-    def act(self, model: TrainedModel, optimizer: torch.optim.Adam, means: Tensor, noise: torch.Generator) -> None:
+    def act(
+        self, model: TrainedModel, optimizer: torch.optim.Adam, means: Tensor, noise: torch.Generator
+    ) -> None:
         """Grow and prune. means: [N, K, 3] of all coupled primitives, world units."""
         c, n = self.config.control, model.anchors
         judged = self.drawn >= min(c.minimum_views, 2 * self.schedule.every)
@@ -108,7 +110,9 @@ class AdaptiveControl:
         grown: dict[str, list[Tensor]] = {name: [] for name in ("coordinates", "references", "log_scales")}
         for level, (factor, size) in enumerate(GROWTH_LEVELS):
             asks = flat >= c.gradient_threshold * factor
-            asks &= torch.rand(len(flat), generator=noise, device=flat.device) < c.growth_probability ** (level + 1)
+            asks &= torch.rand(len(flat), generator=noise, device=flat.device) < c.growth_probability ** (
+                level + 1
+            )
             asks &= (target.abs() < COORDINATE_LIMIT - 16).all(1)
             slots = torch.nonzero(asks).view(-1)
             if len(slots) == 0 or room <= 0:

@@ -45,7 +45,9 @@ def set_learning_rates(optimizer: torch.optim.Optimizer, progress: float) -> Non
 
 
 @torch.no_grad()
-def replace_rows(model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]) -> None:
+def replace_rows(
+    model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]
+) -> None:
     """Keep some anchors and append others, in the parameters and in Adam's moments (zero for new anchors).
 
     kept: [N] bool; added: rows by name for `coordinates`, `mask` and every anchor parameter.

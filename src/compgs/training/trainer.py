@@ -12,6 +12,7 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import Config, check_config, load_config
+from compgs.entropy import Quantized
 from compgs.errors import CheckpointError, ConfigError, TrainingError
 from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer
 from compgs.model.prediction import OPACITY_CUTOFF, Prediction, predict
@@ -119,7 +120,9 @@ class Trainer:
 
         rows = self.visible_anchors(view.camera)
         if len(rows) == 0:
-            raise TrainingError(f"step {self.step}: no anchor is visible in {view.name}; are the poses right?")
+            raise TrainingError(
+                f"step {self.step}: no anchor is visible in {view.name}; are the poses right?"
+            )
         latents = self.model.quantized(
             rows, rate=progress >= t.rate_start, noise=self.noise, stored_weights=stored
         )
@@ -154,7 +157,9 @@ class Trainer:
 
     def target(self, view_index: int) -> Target:
         if view_index not in self.targets:
-            self.targets[view_index] = Target.from_image(self.scene.train_views[view_index].image, self.device)
+            self.targets[view_index] = Target.from_image(
+                self.scene.train_views[view_index].image, self.device
+            )
         return self.targets[view_index]
 
     @torch.no_grad()
@@ -166,7 +171,7 @@ class Trainer:
         radii = 2.0 * sizes[:, :3].amax(1) + 3.0 * sizes[:, 3:].amax(1)
         return torch.nonzero(visible_mask(model.positions(), radii, camera, self.settings)).view(-1)
 
-    def predict(self, latents, rows: Tensor, camera: Camera, stored: bool) -> Prediction:  # type: ignore[no-untyped-def]
+    def predict(self, latents: Quantized, rows: Tensor, camera: Camera, stored: bool) -> Prediction:
         center = torch.as_tensor(camera.center, dtype=torch.float32, device=self.device)
         weights = self.model.stored_head_weights() if stored else None
         primitives = self.model.primitives(latents, rows)
@@ -269,7 +274,9 @@ class Trainer:
             "shuffle": self.shuffle.bit_generator.state,
             "views": [view.name for view in self.scene.train_views],
         }
-        save_checkpoint(path, Checkpoint(self.model, optimizer_tensors(self.model, self.optimizer), extra, state))
+        save_checkpoint(
+            path, Checkpoint(self.model, optimizer_tensors(self.model, self.optimizer), extra, state)
+        )
 
     @classmethod
     def resumed(cls, scene: Scene, checkpoint: Checkpoint, config: Config, device: torch.device) -> "Trainer":
@@ -304,12 +311,14 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.training.seed)
         model = TrainedModel(
-            config, torch.from_numpy(coordinates), voxel_size, scene.extent, tuple(scene.background)
+            config, torch.from_numpy(coordinates), voxel_size, scene.extent, scene.background
         )
     neighbours = min(4, len(coordinates))
     distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(len(coordinates), neighbours)
     spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(1)
     with torch.no_grad():
-        model.log_scales.copy_(torch.from_numpy(np.log(np.maximum(spread, 0.1))).float()[:, None].expand(-1, 6))
+        model.log_scales.copy_(
+            torch.from_numpy(np.log(np.maximum(spread, 0.1))).float()[:, None].expand(-1, 6)
+        )
         model.entropy.fit_covariance_prior(model.log_scales)
     return model
