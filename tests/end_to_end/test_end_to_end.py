@@ -13,12 +13,14 @@ import pytest
 import compgs
 from compgs.cli import train as train_command
 from compgs.cli.main import main
+from compgs.cli.settings import with_settings
 from compgs.metrics import psnr, to_8bit
+from compgs.render import render
 from compgs.training import TrainingStatus
 
 pytestmark = pytest.mark.slow
 
-STEPS = 60
+STEPS = 40
 OPTIONS = ["--preset", "quick", "--steps", str(STEPS), "--seed", "7"]
 
 
@@ -33,7 +35,7 @@ def in_a_new_process(*arguments: object) -> str:
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data") / "scene"
-    assert main(["demo-scene", str(folder), "--views", "12", "--width", "96", "--height", "72"]) == 0
+    assert main(["demo-scene", str(folder), "--views", "40", "--width", "64", "--height", "48"]) == 0
     return folder
 
 
@@ -47,7 +49,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, scene_folder: Path) -> Path:
 
 def test_a_run_leaves_everything_it_promises(run: Path) -> None:
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
-    views = {f"test/{kind}/0000{i}.png" for kind in ("renders", "gt") for i in range(2)}
+    views = {f"test/{kind}/0000{i}.png" for kind in ("renders", "gt") for i in range(5)}
     expected = {"tiny.cgs", "results.json", "per_view.json", "config.json", "training.json", "cameras.json"}
     assert names >= expected | views | {"contact_sheet.png", "checkpoint.safetensors"}
     assert not [name for name in names if "partial" in name]
@@ -67,11 +69,14 @@ def test_another_process_finds_what_the_training_reported(
     assert f"{ours['bytes']:,} bytes" in shown
 
 
-def test_the_scene_is_recognizable_after_a_few_steps(run: Path) -> None:
-    results = json.loads((run / "results.json").read_text())
-    # A gray image of the right brightness has about 14 dB on this scene.
-    assert results["psnr"] > 16
-    assert results["views"] == 2
+def test_held_out_views_are_recognizable_after_a_few_seconds(scene_folder: Path) -> None:
+    scene = compgs.load_scene(scene_folder)
+    # Few, large anchors: the scene's coarse shapes are learned in a few hundred steps.
+    config = with_settings(compgs.load_config("quick"), ["training.steps=300", "model.voxel_size=0.15"])
+    model = compgs.train(scene, config).as_hybrid_model()
+    for view in scene.test_views:
+        flat = np.broadcast_to(view.image.mean((0, 1)).round().astype(np.uint8), view.image.shape)
+        assert psnr(to_8bit(render(model, view.camera).image), view.image) > psnr(flat, view.image) + 1
 
 
 def test_encoding_a_run_again_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
@@ -79,32 +84,32 @@ def test_encoding_a_run_again_gives_the_same_bytes(run: Path, tmp_path: Path) ->
     assert (tmp_path / "again.cgs").read_bytes() == (run / "tiny.cgs").read_bytes()
 
 
-def test_symbols_do_not_depend_on_the_number_of_threads(run: Path, tmp_path: Path) -> None:
-    for threads in (1, 2):
-        in_a_new_process("decode", run / "tiny.cgs", "-o", tmp_path / str(threads), "--threads", threads)
-    with np.load(tmp_path / "1" / "latents.npz") as one, np.load(tmp_path / "2" / "latents.npz") as two:
-        assert set(one) == set(two) == {"positions", "log_scales", "references", "residuals", "anchor_index"}
+def test_symbols_do_not_depend_on_process_or_number_of_threads(run: Path, tmp_path: Path) -> None:
+    in_a_new_process("decode", run / "tiny.cgs", "-o", tmp_path / "one", "--threads", 1)
+    assert main(["decode", str(run / "tiny.cgs"), "-o", str(tmp_path / "all")]) == 0
+    with np.load(tmp_path / "one" / "latents.npz") as one, np.load(tmp_path / "all" / "latents.npz") as every:
+        assert (
+            set(one) == set(every) == {"positions", "log_scales", "references", "residuals", "anchor_index"}
+        )
         for name in one:
-            np.testing.assert_array_equal(one[name], two[name])
+            np.testing.assert_array_equal(one[name], every[name])
 
 
 def test_info_and_render_need_nothing_but_the_file(run: Path, tmp_path: Path) -> None:
-    shown = in_a_new_process("info", run / "tiny.cgs")
-    assert f"{(run / 'tiny.cgs').stat().st_size:,} bytes" in shown
-    in_a_new_process(
-        "render", run / "tiny.cgs", "--frames", 3, "--width", 64, "--height", 48, "-o", tmp_path / "orbit"
-    )
+    file = tmp_path / "alone.cgs"
+    file.write_bytes((run / "tiny.cgs").read_bytes())
+    assert f"{file.stat().st_size:,} bytes" in in_a_new_process("info", file)
+    circle = ["--frames", "3", "--width", "64", "--height", "48"]
+    assert main(["render", str(file), *circle, "-o", str(tmp_path / "orbit")]) == 0
     assert len(list((tmp_path / "orbit").glob("*.png"))) == 3
-    in_a_new_process("render", run / "tiny.cgs", "--cameras", run / "cameras.json", "-o", tmp_path / "views")
-    for image in sorted((tmp_path / "views").glob("*.png")):
-        assert image.read_bytes() == (run / "test" / "renders" / image.name).read_bytes()
+    in_a_new_process("render", file, "--cameras", run / "cameras.json", "-o", tmp_path / "views")
+    for image in (run / "test" / "renders").iterdir():
+        assert image.read_bytes() == (tmp_path / "views" / image.name).read_bytes()
 
 
 def test_python_does_the_same_and_the_same_seed_gives_the_same_file(
     run: Path, scene_folder: Path, tmp_path: Path
 ) -> None:
-    from compgs.cli.settings import with_settings
-
     scene = compgs.load_scene(scene_folder)
     config = with_settings(compgs.load_config("quick"), [f"training.steps={STEPS}", "training.seed=7"])
     model = compgs.train(scene, config)
@@ -113,8 +118,8 @@ def test_python_does_the_same_and_the_same_seed_gives_the_same_file(
 
     decoded = compgs.decode(tmp_path / "python.cgs")
     for view in scene.test_views:
-        before = psnr(to_8bit(compgs.render(model.as_hybrid_model(), view.camera).image), view.image)
-        after = psnr(to_8bit(compgs.render(decoded, view.camera).image), view.image)
+        before = psnr(to_8bit(render(model.as_hybrid_model(), view.camera).image), view.image)
+        after = psnr(to_8bit(render(decoded, view.camera).image), view.image)
         assert after == pytest.approx(before, abs=0.01)
 
 

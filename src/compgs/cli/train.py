@@ -219,4 +219,5 @@ def interrupted(folder: Path) -> str:
     checkpoint = folder / CHECKPOINT_NAME
     if not checkpoint.is_file():
         return "interrupted before the first checkpoint: start again with --overwrite"
-    return f"interrupted; the checkpoint is {checkpoint}\ncontinue with: compgs train -o {shlex.quote(str(folder))} --resume"
+    command = f"compgs train -o {shlex.quote(str(folder))} --resume"
+    return f"interrupted; the checkpoint is {checkpoint}\ncontinue with: {command}"
