@@ -6,7 +6,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from compgs.entropy.quantization import quantize_weight
+from compgs.entropy.quantization import quantize_weight, round_straight_through
 
 # A power of two, so that the decoder's leaky ReLU is a shift.
 NEGATIVE_SLOPE = 2.0**-6
@@ -16,6 +16,15 @@ OCTAVE = 12.0
 UNIT_SCALE = 60.0
 
 
+# Fractional bits of the decoder's fixed-point numbers (codec.integer_network).
+FRACTION_BITS = 12
+
+
+def round_fixed(x: Tensor) -> Tensor:
+    """The nearest number that the decoder's fixed point can hold, straight-through."""
+    return round_straight_through(x * 2.0**FRACTION_BITS) * 2.0**-FRACTION_BITS
+
+
 class EntropyNetwork(nn.Module):
     """Means and scale indices of C Gaussian-distributed symbols from already decoded latents (CompGS Sec. 3.3).
 
@@ -23,7 +32,7 @@ class EntropyNetwork(nn.Module):
 
     `mean_gain` sets the unit in which the means are learned, so that one learning rate serves embeddings (means of
     a few steps) and log scales (means of dozens of steps). Gains are folded into the last layer: `layers` gives the
-    weights that the file will hold.
+    weights that the file will hold, and with `bits` everything is rounded as the decoder rounds it.
     """
 
     gain: Tensor
@@ -53,7 +62,9 @@ class EntropyNetwork(nn.Module):
             if i == len(self.weights) - 1:
                 weight = weight * self.gain[:, None]
                 bias = bias * self.gain + self.offset
-            result.append((weight if bits is None else quantize_weight(weight, bits), bias))
+            if bits is not None:
+                weight, bias = quantize_weight(weight, bits), round_fixed(bias)
+            result.append((weight, bias))
         return result
 
     def forward(self, x: Tensor, bits: int | None = None) -> tuple[Tensor, Tensor]:
@@ -61,6 +72,8 @@ class EntropyNetwork(nn.Module):
         layers = self.layers(bits)
         for i, (weight, bias) in enumerate(layers):
             x = torch.addmm(bias, x, weight.t())
+            if bits is not None:
+                x = round_fixed(x)
             if i < len(layers) - 1:
                 x = nn.functional.leaky_relu(x, NEGATIVE_SLOPE)
         return x[:, : self.channels], x[:, self.channels :]
