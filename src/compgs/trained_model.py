@@ -72,8 +72,12 @@ class TrainedModel(nn.Module):
         rate: bool = False,
         noise: torch.Generator | None = None,
         stored_weights: bool = True,
+        masked: bool = False,
     ) -> Quantized:
-        """Quantized latents (in steps) and their bits; see EntropyModel.forward."""
+        """Quantized latents (in steps) and their bits; see EntropyModel.forward.
+
+        `masked`: bits of those coupled primitives alone that exist.
+        """
 
         def chosen(parameter: Tensor) -> Tensor:
             return parameter if rows is None else parameter.index_select(0, rows)
@@ -86,6 +90,7 @@ class TrainedModel(nn.Module):
             rate=rate,
             noise=noise,
             network_bits=bits,
+            mask=chosen(self.mask) if masked else None,
         )
 
     def primitives(self, latents: Quantized, rows: Tensor | None = None) -> Primitives:
@@ -131,5 +136,6 @@ class TrainedModel(nn.Module):
     @torch.no_grad()
     def estimated_bits(self) -> dict[str, float]:
         """Bits of each stream of the file, by the model's own probabilities (weights and positions not included)."""
-        bits = self.quantized(rate=True).bits
+        coded = torch.nonzero(self.mask.any(1)).view(-1)
+        bits = self.quantized(coded, rate=True, masked=True).bits
         return {name: float(b.sum(dtype=torch.float64)) for name, b in bits.items()}

@@ -102,6 +102,7 @@ class EntropyModel(nn.Module):
         rate: bool,
         noise: torch.Generator | None = None,
         network_bits: int | None = None,
+        mask: Tensor | None = None,  # [N, K] bool: coupled primitives that are coded; default all
     ) -> Quantized:
         """Quantize, and estimate the bits if `rate`.
 
@@ -124,9 +125,18 @@ class EntropyModel(nn.Module):
                 "reference": gaussian_bits(_relax(references - mean_f, noise), scale_f),
                 "covariance": gaussian_bits(_relax(covariances - mean_c, noise), scale_c),
                 "residual_hyper": self.residual_density.bits(_relax(z_g, noise)),
-                "residual": gaussian_bits(_relax(residuals - mean_g, noise), scale_g),
+                "residual": _coded_bits(_relax(residuals - mean_g, noise), scale_g, mask),
             }
         return Quantized(f_hat, c_hat, g_hat, bits)
+
+
+def _coded_bits(x: Tensor, scale: Tensor, mask: Tensor | None) -> Tensor:
+    """[N] bits of the residual embeddings of those coupled primitives that are coded."""
+    if mask is None:
+        return gaussian_bits(x, scale)
+    slots = mask.numel()
+    bits = gaussian_bits(x.reshape(slots, -1), scale.reshape(slots, -1)).view_as(mask)
+    return (bits * mask).sum(1)
 
 
 def _relax(x: Tensor, noise: torch.Generator | None) -> Tensor:

@@ -33,7 +33,8 @@ from compgs.training.optimizers import make_optimizer, set_learning_rates
 
 REPORT_EVERY = 10  # steps between two status reports
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it looks at every anchor
-POSITION_BITS = 15.0  # bits per anchor position, for the estimate only
+POSITION_BITS = 10.0  # bits per anchor position, for the estimate only
+CODED_WEIGHT_BITS = -1.0  # bits that entropy coding takes off a stored weight, for the estimate only
 
 
 @dataclass(frozen=True)
@@ -244,9 +245,9 @@ class Trainer:
         """Of the file, were it written now."""
         e, model = self.config.entropy, self.model
         bits = sum(model.estimated_bits().values()) + POSITION_BITS * model.anchors
-        bits += e.head_bits * sum(p.numel() for p in model.heads.parameters())
+        bits += (e.head_bits + CODED_WEIGHT_BITS) * sum(p.numel() for p in model.heads.parameters())
         for network in ("reference_network", "covariance_network", "residual_network"):
-            bits += e.network_bits * sum(p.numel() for p in getattr(model.entropy, network).parameters())
+            bits += (e.network_bits + CODED_WEIGHT_BITS) * sum(p.numel() for p in getattr(model.entropy, network).parameters())
         return int(bits / 8)
 
     @torch.no_grad()
