@@ -1,19 +1,20 @@
 """Alpha blending of tiles on the CPU, forward and backward.
 
-A tile is 8 x 32 pixels. Its pixels lie in vectors of LANES = 16: eight columns by two rows, which small
-splats fill better than a row of sixteen. For every entry of a tile, front to back, and every vector of its
-rows:
+A tile is 8 x 32 pixels: its rows fill a vector register, and small splats fill such rows better than wider
+ones. For every entry of a tile, front to back, and every pixel of its rows:
 
     q = |L^T d|^2 - log2 opacity     alpha = 2^-q   (0 below the cutoff, at most the cap)
     color += alpha T color_i         T <- T (1 - alpha)
 
 The sign of T marks a finished pixel. The backward pass runs front to back as well: it carries what is still
-to come, D = sum over the splats behind of (color . gradient) weight, and dL/dalpha = T (color . gradient) - D
-/ (1 - alpha). Gradients of a splat are written once per tile and summed per splat afterwards, always in the
-same order: no atomics, and the same bits with any number of threads.
+to come, D = sum over the splats behind of (color . gradient) weight, and
+dL/dalpha = T (color . gradient) - D / (1 - alpha). Gradients of a splat are written once per tile and summed
+per splat afterwards, always in the same order: no atomics, and the same bits with any number of threads.
 
-Indices are unsigned and the scratch is one buffer with constant offsets; otherwise the loops are not
-vectorized, which costs a factor of ten and is silent (a test looks for vector instructions).
+For the compiler to vectorize, indices are unsigned, the scratch is one buffer of planes with constant
+offsets, and the loops over pixels are flat. Losing it costs a factor of ten and is silent: a test looks for
+vector instructions. A plane per coordinate costs less than conversions of the loop's index, and sums as local
+variables (rather than in the buffer) spare the compiled code a check for overlaps at every entry.
 """
 
 import numpy as np
@@ -28,18 +29,11 @@ MOMENTS = 9  # gradient sums of a splat in a tile: alpha, d (2), d d^T (3), colo
 ENTRIES_PER_CHECK = 16  # between two tests whether a tile is finished
 
 U = np.uint64
-U0 = U(0)
-N_LANES = U(16)
+WIDTH = U(TILE_WIDTH)
 PIXELS = U(TILE_WIDTH * TILE_HEIGHT)
-LAST_LANE_COLUMN = np.uint32(TILE_WIDTH - 1)  # lane i: column i & 7, row i >> 3
-LANE_ROW = np.uint32(3)
-ROWS_PER_VECTOR = 16 // TILE_WIDTH
-# Offsets in the scratch buffer. T first; then color (forward), or the image's gradient and D (backward).
-RED, GREEN, BLUE, BEHIND = PIXELS, U(2) * PIXELS, U(3) * PIXELS, U(4) * PIXELS
-SUM0 = U(5) * PIXELS
-SUM1, SUM2, SUM3, SUM4, SUM5 = (SUM0 + U(16 * n) for n in range(1, 6))
-FORWARD_SCRATCH = 4 * TILE_WIDTH * TILE_HEIGHT
-BACKWARD_SCRATCH = 5 * TILE_WIDTH * TILE_HEIGHT + 6 * 16
+# Planes of the scratch buffer. First T; then the image (forward), or its gradient (backward), and D.
+COLUMN, ROW, RED, GREEN, BLUE, BEHIND = (U(plane) * PIXELS for plane in range(1, 7))
+SCRATCH = 7 * TILE_WIDTH * TILE_HEIGHT
 
 # 2^f on [0, 1): least maximal relative error, 1.6e-7 with float32 rounding. An error of 1e-5 would already
 # flip decisions at the alpha cutoff and show in the image.
@@ -67,9 +61,9 @@ def blend_forward(packed, starts, entries, background, cutoff, cap, stop, image,
         tile_y, tile_x = tile // tiles_x, tile % tiles_x
         left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
         x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
-        s = np.zeros(FORWARD_SCRATCH, np.float32)
+        s = np.zeros(SCRATCH, np.float32)
         splats = np.empty((ENTRIES_PER_CHECK, PARAMETERS), np.float32)
-        start_transmittance(s, left, top, width, height)
+        start_tile(s, left, top, width, height)
         k, end = starts[tile], starts[tile + 1]
         while k < end:
             check = min(k + ENTRIES_PER_CHECK, end)
@@ -79,30 +73,26 @@ def blend_forward(packed, starts, entries, background, cutoff, cap, stop, image,
                 x, y = splats[j, 0] - x_origin, splats[j, 1] - y_origin
                 l00, l10, l11, log2_opacity = splats[j, 2], splats[j, 3], splats[j, 4], splats[j, 5]
                 red, green, blue = splats[j, 6], splats[j, 7], splats[j, 8]
-                first = (entries[e, 1] >> 8) // ROWS_PER_VECTOR
-                last = (entries[e, 1] & 255) // ROWS_PER_VECTOR
-                for vector in range(first, last + 1):
-                    dy_first = y - f32(vector * ROWS_PER_VECTOR)
-                    base = U(vector) * N_LANES
-                    for lane in range(N_LANES):
-                        dx = x - f32(np.uint32(lane) & LAST_LANE_COLUMN)
-                        dy = dy_first - f32(np.uint32(lane) >> LANE_ROW)
-                        p, r = l00 * dx + l10 * dy, l11 * dy
-                        alpha = min(cap, exp2_minus(p * p + (r * r - log2_opacity)))
-                        alpha = alpha if alpha >= cutoff else ZERO
-                        t = s[base + lane]
-                        weight = alpha * t
-                        t_next = t - weight
-                        open_ = t_next > stop
-                        weight = weight if open_ else ZERO
-                        s[base + lane] = t_next if open_ else -abs(t)
-                        s[base + lane + RED] += weight * red
-                        s[base + lane + GREEN] += weight * green
-                        s[base + lane + BLUE] += weight * blue
+                first_row, last_row = entries[e, 1] >> 8, entries[e, 1] & 255
+                for pixel in range(U(first_row) * WIDTH, U(last_row + 1) * WIDTH):
+                    dx = x - s[pixel + COLUMN]
+                    dy = y - s[pixel + ROW]
+                    p, r = l00 * dx + l10 * dy, l11 * dy
+                    alpha = min(cap, exp2_minus(p * p + (r * r - log2_opacity)))
+                    alpha = alpha if alpha >= cutoff else ZERO
+                    t = s[pixel]
+                    weight = alpha * t
+                    t_next = t - weight
+                    open_ = t_next > stop
+                    weight = weight if open_ else ZERO
+                    s[pixel] = t_next if open_ else -abs(t)
+                    s[pixel + RED] += weight * red
+                    s[pixel + GREEN] += weight * green
+                    s[pixel + BLUE] += weight * blue
             k = check
             most = ZERO
-            for p in range(PIXELS):
-                most = max(most, s[p])
+            for i in range(PIXELS):
+                most = max(most, s[i])
             if most <= ZERO:
                 break
         ends[tile] = k
@@ -126,33 +116,25 @@ def gather_splats(packed, entries, begin, end, splats):
 
 
 @njit(inline="always")
-def start_transmittance(s, left, top, width, height):
-    """One inside the image; minus one (finished) for a tile's pixels beyond its edge."""
+def start_tile(s, left, top, width, height):
+    """Pixel coordinates, and T: one inside the image, minus one (finished) beyond its edge."""
     columns, rows = width - left, height - top
     for row in range(TILE_HEIGHT):
         for column in range(TILE_WIDTH):
-            s[U(row * TILE_WIDTH + column)] = ONE if row < rows and column < columns else -ONE
+            pixel = U(row * TILE_WIDTH + column)
+            s[pixel] = ONE if row < rows and column < columns else -ONE
+            s[pixel + COLUMN] = f32(column)
+            s[pixel + ROW] = f32(row)
 
 
 @njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
 def blend_backward(
-    packed,
-    starts,
-    entries,
-    ends,
-    cutoff,
-    cap,
-    stop,
-    image,
-    transmittance,
-    grad_image,
-    grad_transmittance,
-    moments,
-):
+    packed, starts, entries, ends, cutoff, cap, stop,
+    image, transmittance, grad_image, grad_transmittance, moments,
+):  # fmt: skip
     """Fills moments [E, MOMENTS]: for each entry the sums over its pixels that gradients are made of.
 
-    With v = alpha dL/dalpha: v, v dx, v dy, v dx^2, v dx dy, v dy^2, then weight * dL/dimage for the three
-    colors.
+    With v = alpha dL/dalpha: v, v dx, v dy, v dx^2, v dx dy, v dy^2, then weight dL/dimage (3).
     """
     height, width = transmittance.shape
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
@@ -160,9 +142,9 @@ def blend_backward(
         tile_y, tile_x = tile // tiles_x, tile % tiles_x
         left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
         x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
-        s = np.zeros(BACKWARD_SCRATCH, np.float32)
+        s = np.zeros(SCRATCH, np.float32)
         splats = np.empty((ENTRIES_PER_CHECK, PARAMETERS), np.float32)
-        start_transmittance(s, left, top, width, height)
+        start_tile(s, left, top, width, height)
         for row in range(min(TILE_HEIGHT, height - top)):
             for column in range(min(TILE_WIDTH, width - left)):
                 pixel = U(row * TILE_WIDTH + column)
@@ -183,68 +165,39 @@ def blend_backward(
                 x, y = splats[j, 0] - x_origin, splats[j, 1] - y_origin
                 l00, l10, l11, log2_opacity = splats[j, 2], splats[j, 3], splats[j, 4], splats[j, 5]
                 red, green, blue = splats[j, 6], splats[j, 7], splats[j, 8]
-                first = (entries[e, 1] >> 8) // ROWS_PER_VECTOR
-                last = (entries[e, 1] & 255) // ROWS_PER_VECTOR
-                for lane in range(N_LANES):
-                    s[lane + SUM0] = ZERO
-                    s[lane + SUM1] = ZERO
-                    s[lane + SUM2] = ZERO
-                    s[lane + SUM3] = ZERO
-                    s[lane + SUM4] = ZERO
-                    s[lane + SUM5] = ZERO
-                for vector in range(first, last + 1):
-                    dy_first = y - f32(vector * ROWS_PER_VECTOR)
-                    base = U(vector) * N_LANES
-                    for lane in range(N_LANES):
-                        dx = x - f32(np.uint32(lane) & LAST_LANE_COLUMN)
-                        dy = dy_first - f32(np.uint32(lane) >> LANE_ROW)
-                        p, r = l00 * dx + l10 * dy, l11 * dy
-                        uncapped = exp2_minus(p * p + (r * r - log2_opacity))
-                        alpha = min(cap, uncapped)
-                        alpha = alpha if alpha >= cutoff else ZERO
-                        t = s[base + lane]
-                        weight = alpha * t
-                        t_next = t - weight
-                        open_ = t_next > stop
-                        weight = weight if open_ else ZERO
-                        s[base + lane] = t_next if open_ else -abs(t)
-                        g0, g1, g2 = s[base + lane + RED], s[base + lane + GREEN], s[base + lane + BLUE]
-                        color_grad = g0 * red + g1 * green + g2 * blue
-                        behind = s[base + lane + BEHIND] - weight * color_grad
-                        s[base + lane + BEHIND] = behind
-                        # Kept pixels only; a capped alpha does not change with the splat.
-                        v = weight * color_grad - alpha * behind / (ONE - alpha)
-                        v = v if open_ else ZERO
-                        v = v if uncapped <= cap else ZERO
-                        s[lane + SUM0] += v
-                        s[lane + SUM1] += v * dy
-                        s[lane + SUM2] += v * dy * dy
-                        s[lane + SUM3] += weight * g0
-                        s[lane + SUM4] += weight * g1
-                        s[lane + SUM5] += weight * g2
-                m0, mx, my, mxx, mxy, myy, m_red, m_green, m_blue = (
-                    ZERO,
-                    ZERO,
-                    ZERO,
-                    ZERO,
-                    ZERO,
-                    ZERO,
-                    ZERO,
-                    ZERO,
-                    ZERO,
-                )
-                for lane in range(N_LANES):
-                    dx = x - f32(np.uint32(lane) & LAST_LANE_COLUMN)
-                    v, v_dy = s[lane + SUM0], s[lane + SUM1]
+                first_row, last_row = entries[e, 1] >> 8, entries[e, 1] & 255
+                m0 = mx = my = mxx = mxy = myy = m_red = m_green = m_blue = ZERO
+                for pixel in range(U(first_row) * WIDTH, U(last_row + 1) * WIDTH):
+                    dx = x - s[pixel + COLUMN]
+                    dy = y - s[pixel + ROW]
+                    p, r = l00 * dx + l10 * dy, l11 * dy
+                    uncapped = exp2_minus(p * p + (r * r - log2_opacity))
+                    alpha = min(cap, uncapped)
+                    alpha = alpha if alpha >= cutoff else ZERO
+                    t = s[pixel]
+                    weight = alpha * t
+                    t_next = t - weight
+                    open_ = t_next > stop
+                    weight = weight if open_ else ZERO
+                    s[pixel] = t_next if open_ else -abs(t)
+                    g0, g1, g2 = s[pixel + RED], s[pixel + GREEN], s[pixel + BLUE]
+                    color_grad = g0 * red + g1 * green + g2 * blue
+                    behind = s[pixel + BEHIND] - weight * color_grad
+                    s[pixel + BEHIND] = behind
+                    # Kept pixels only; a capped alpha does not change with the splat.
+                    v = weight * color_grad - alpha * behind / (ONE - alpha)
+                    v = v if open_ else ZERO
+                    v = v if uncapped <= cap else ZERO
+                    v_dx, v_dy = v * dx, v * dy
                     m0 += v
-                    mx += v * dx
+                    mx += v_dx
                     my += v_dy
-                    mxx += v * dx * dx
-                    mxy += v_dy * dx
-                    myy += s[lane + SUM2]
-                    m_red += s[lane + SUM3]
-                    m_green += s[lane + SUM4]
-                    m_blue += s[lane + SUM5]
+                    mxx += v_dx * dx
+                    mxy += v_dx * dy
+                    myy += v_dy * dy
+                    m_red += weight * g0
+                    m_green += weight * g1
+                    m_blue += weight * g2
                 moments[e, 0] = m0
                 moments[e, 1] = mx
                 moments[e, 2] = my
@@ -278,7 +231,7 @@ def sum_moments(
                 grad_opacities[i] = ZERO
                 grad_colors[i, :] = ZERO
                 continue
-            m0, mx, my, mxx, mxy, myy, red, green, blue = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+            m0 = mx = my = mxx = mxy = myy = red = green = blue = ZERO
             for slot in range(first_slot[i], first_slot[i] + slots_used[i]):
                 e = slots[slot]
                 m0 += moments[e, 0]
