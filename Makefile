@@ -33,7 +33,7 @@ demo: venv
 	@echo "== a scene: ray-traced objects, written as a capture would be"
 	@$(BIN)/compgs demo-scene demo/scene --overwrite
 	@echo "== training and encoding"
-	@$(BIN)/compgs train demo/scene -o demo/run --preset quick --overwrite
+	@$(BIN)/compgs train demo/scene -o demo/run --preset quick --steps 2000 --overwrite
 	@$(BIN)/compgs encode demo/run -o demo.cgs --overwrite >/dev/null
 	@echo "== demo.cgs, decoded in a new process and rendered from the held-out views"
 	@$(BIN)/compgs evaluate demo.cgs demo/scene -o demo/evaluation --overwrite

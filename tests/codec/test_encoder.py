@@ -46,7 +46,9 @@ def test_the_decoded_scene_is_the_one_that_training_rendered(tmp_path, hidden):
         # Hidden layers round in between: a latent in a thousand may fall to the neighbouring step.
         differs = (mine - getattr(decoded.primitives, name)).abs() > 1e-3
         assert differs.float().mean() < (2e-3 if hidden else 1e-4)
-    for (_, a), (_, b) in zip(trained.heads.named_parameters(), decoded.heads.named_parameters(), strict=True):
+    for (_, a), (_, b) in zip(
+        trained.heads.named_parameters(), decoded.heads.named_parameters(), strict=True
+    ):
         assert torch.equal(a, b)
 
 

@@ -31,5 +31,5 @@ def test_inner_loops_use_vector_instructions(name):
     module, signature = KERNELS[name]
     kernel = njit(signature, fastmath=module.FASTMATH, error_model="numpy")(getattr(module, name).py_func)
     assembly = kernel.inspect_asm(kernel.signatures[0])
-    # A vectorized exp2 alone has five; without vectorization only a few of the loops at the edges remain.
-    assert len(PACKED.findall(assembly)) >= 15
+    # The loop of blend_forward has fifteen, the others more; without it at most six, elsewhere, are left.
+    assert len(PACKED.findall(assembly)) >= 12

@@ -54,6 +54,19 @@ def print_components(components: Mapping[str, int], anchors: int, coupled: int) 
     console.print(table)
 
 
+def print_profile(milliseconds: Mapping[str, float]) -> None:
+    """Where a training step's time goes."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("part of a step")
+    table.add_column("ms", justify="right")
+    table.add_column("share", justify="right")
+    total = sum(milliseconds.values())
+    for part, value in [*milliseconds.items(), ("total", total)]:
+        style = "bold" if part == "total" else None
+        table.add_row(part, f"{value:.2f}", f"{100 * value / max(total, 1e-9):.0f} %", style=style)
+    console.print(table)
+
+
 def print_results(results: "Results") -> None:
     """The short table of an evaluation."""
     table = Table(box=None, pad_edge=False, show_header=False)

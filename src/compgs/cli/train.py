@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
 from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, UsageError, one_scene
-from compgs.cli.console import duration, print_results, say, size
+from compgs.cli.console import duration, print_profile, print_results, say, size
 from compgs.cli.progress import counting, training
 from compgs.cli.run_folder import (
     CHECKPOINT_NAME,
@@ -87,6 +87,9 @@ class Train(ComputingCommand, SceneOptions):
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace a run that is in RUN already."""
 
+    profile: FlagCreatePairsOff[bool] = False
+    """Print where a step's time goes; training.json has it too."""
+
     lpips: FlagCreatePairsOff[bool] = False
     """Also measure LPIPS (needs `pip install 'compgs[lpips]'`)."""
 
@@ -138,8 +141,9 @@ class Train(ComputingCommand, SceneOptions):
 
     def train(self, scene: "Scene", settings: RunSettings, folder: Path) -> "TrainedModel":
         """Raises KeyboardInterrupt, with what to do next, when the user stops it."""
-        from compgs.training import train
+        from compgs.training import StepProfile, train
 
+        profile = StepProfile() if self.profile else None
         last: TrainingStatus | None = None
         start = time.perf_counter()
         try:
@@ -157,6 +161,7 @@ class Train(ComputingCommand, SceneOptions):
                     resume=self.resume,
                     on_progress=on_progress,
                     device=self.device,
+                    profile=profile,
                 )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(interrupted(folder)) from None
@@ -171,9 +176,12 @@ class Train(ComputingCommand, SceneOptions):
                     "seconds": seconds,
                     "seconds_per_step": last.seconds_per_step,
                     "resumed": self.resume,
+                    **({"milliseconds_per_step": profile.milliseconds()} if profile else {}),
                 },
             )
         say(f"trained in {duration(seconds)}")
+        if profile:
+            print_profile(profile.milliseconds())
         return model
 
     def encode_and_evaluate(self, scene: "Scene", model: "TrainedModel", folder: Path) -> None:

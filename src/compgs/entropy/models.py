@@ -80,6 +80,11 @@ class EntropyModel(nn.Module):
         """s_Sigma: learned quantization step of the log scales (Sec. 3.4)."""
         return self.log_covariance_step.exp().clamp_min(SMALLEST_COVARIANCE_STEP)
 
+    @property
+    def coded_networks(self) -> tuple[EntropyNetwork, ...]:
+        """The networks that the decoder needs, and so the file holds."""
+        return self.reference_network, self.covariance_network, self.residual_network
+
     @torch.no_grad()
     def fit_covariance_prior(self, log_scales: Tensor) -> None:
         """Start the covariance prior at the data's mean and spread: from zero it would start without gradient."""

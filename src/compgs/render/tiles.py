@@ -98,11 +98,11 @@ def blend_forward(packed, starts, entries, background, cutoff, cap, stop, image,
         ends[tile] = k
         for row in range(min(TILE_HEIGHT, height - top)):
             for column in range(min(TILE_WIDTH, width - left)):
-                pixel = U(row * TILE_WIDTH + column)
-                t = abs(s[pixel])
-                image[top + row, left + column, 0] = s[pixel + RED] + t * background[0]
-                image[top + row, left + column, 1] = s[pixel + GREEN] + t * background[1]
-                image[top + row, left + column, 2] = s[pixel + BLUE] + t * background[2]
+                at = U(row * TILE_WIDTH + column)
+                t = abs(s[at])
+                image[top + row, left + column, 0] = s[at + RED] + t * background[0]
+                image[top + row, left + column, 1] = s[at + GREEN] + t * background[1]
+                image[top + row, left + column, 2] = s[at + BLUE] + t * background[2]
                 transmittance[top + row, left + column] = t
 
 
@@ -147,7 +147,7 @@ def blend_backward(
         start_tile(s, left, top, width, height)
         for row in range(min(TILE_HEIGHT, height - top)):
             for column in range(min(TILE_WIDTH, width - left)):
-                pixel = U(row * TILE_WIDTH + column)
+                at = U(row * TILE_WIDTH + column)
                 g0 = grad_image[top + row, left + column, 0]
                 g1 = grad_image[top + row, left + column, 1]
                 g2 = grad_image[top + row, left + column, 2]
@@ -156,7 +156,7 @@ def blend_backward(
                 behind += (
                     grad_transmittance[top + row, left + column] * transmittance[top + row, left + column]
                 )
-                s[pixel + RED], s[pixel + GREEN], s[pixel + BLUE], s[pixel + BEHIND] = g0, g1, g2, behind
+                s[at + RED], s[at + GREEN], s[at + BLUE], s[at + BEHIND] = g0, g1, g2, behind
         for batch in range(starts[tile], ends[tile], ENTRIES_PER_CHECK):
             batch_end = min(batch + ENTRIES_PER_CHECK, ends[tile])
             gather_splats(packed, entries, batch, batch_end, splats)

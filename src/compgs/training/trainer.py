@@ -30,6 +30,7 @@ from compgs.training.checkpoint import (
 )
 from compgs.training.control import AdaptiveControl, make_schedule
 from compgs.training.optimizers import make_optimizer, set_learning_rates
+from compgs.training.profile import NoProfile, StepProfile
 
 REPORT_EVERY = 10  # steps between two status reports
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it looks at every anchor
@@ -66,11 +67,13 @@ def train(
     resume: bool = False,
     on_progress: Callable[[TrainingStatus], None] | None = None,
     device: str | torch.device | None = None,
+    profile: StepProfile | None = None,
 ) -> TrainedModel:
     """Train a scene; the result is ready for `compgs.encode`.
 
     With `output`, a folder, checkpoints are written there, also when the run is interrupted; `resume` continues from
-    the last one exactly as if the run had not stopped. Default device: CUDA where there is one.
+    the last one exactly as if the run had not stopped. `profile` gathers where the time goes. Default device: CUDA
+    where there is one.
 
     Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
     """
@@ -84,6 +87,7 @@ def train(
         trainer = Trainer.resumed(scene, load_checkpoint(path), config, chosen)
     else:
         trainer = Trainer(scene, config, chosen)
+    trainer.profile = profile or trainer.profile
     trainer.run(path, on_progress)
     return trainer.model
 
@@ -109,6 +113,7 @@ class Trainer:
         self.targets: dict[int, Target] = {}
         self.settings = RasterSettings(background=scene.background)
         self.step = 0
+        self.profile: StepProfile = NoProfile()
 
     # one step ------------------------------------------------------------------------------------------------------
 
@@ -118,35 +123,56 @@ class Trainer:
         view_index = self.next_view()
         view = self.scene.train_views[view_index]
         stored = progress >= t.quantized_weights
+        profile = self.profile
+        profile.begin()
 
         rows = self.visible_anchors(view.camera)
         if len(rows) == 0:
             raise TrainingError(
                 f"step {self.step}: no anchor is visible in {view.name}; are the poses right?"
             )
+        profile.lap("culling")
         latents = self.model.quantized(
             rows, rate=progress >= t.rate_start, noise=self.noise, stored_weights=stored
         )
+        profile.lap("entropy")
         prediction = self.predict(latents, rows, view.camera, stored)
-        rendered = rasterize(prediction.gaussians, view.camera, self.settings)
+        gaussians = prediction.gaussians
+        profile.lap("prediction")
+        rendered = rasterize(gaussians, view.camera, self.settings)
+        profile.lap("projection and rasterization")
         if self.schedule.active(self.step):
             rendered.means2d.retain_grad()
         distortion = photometric_loss(rendered.image, self.target(view_index), t.ssim_weight)
-        loss = distortion + t.scale_weight * scale_regularizer(prediction.gaussians.scales)
+        loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales)
+        profile.lap("loss")
         if latents.bits:
             elements = self.elements(len(rows))
             loss = rate_distortion_loss(loss, rate(latents.bits, elements, t.rate), t.lmbda)
+        profile.lap("entropy")
+        profile.lap_on_gradient("loss, backward", rendered.image)
+        profile.lap_on_gradient("rasterization, backward", rendered.means2d)
+        profile.lap_on_gradient(
+            "projection, backward", gaussians.means, gaussians.quaternions, gaussians.scales
+        )
+        profile.lap_on_gradient(
+            "prediction, backward", latents.references, latents.residuals, latents.covariances
+        )
         loss.backward()
+        profile.lap("entropy, backward")
 
         set_learning_rates(self.optimizer, progress)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
+        profile.lap("optimizer")
         if self.schedule.active(self.step):
             gradient = rendered.means2d.grad
             if gradient is not None:
                 self.control.observe(rows, prediction, gradient, view.camera)
             if self.schedule.due(self.step):
                 self.control.act(self.model, self.optimizer, self.coupled_means(), self.noise)
+            profile.lap("control")
+        profile.end()
         self.step += 1
         return StepResult(float(loss.detach()), rendered.image.detach(), view)
 
@@ -246,8 +272,8 @@ class Trainer:
         e, model = self.config.entropy, self.model
         bits = sum(model.estimated_bits().values()) + POSITION_BITS * model.anchors
         bits += (e.head_bits + CODED_WEIGHT_BITS) * sum(p.numel() for p in model.heads.parameters())
-        for network in ("reference_network", "covariance_network", "residual_network"):
-            bits += (e.network_bits + CODED_WEIGHT_BITS) * sum(p.numel() for p in getattr(model.entropy, network).parameters())
+        for network in model.entropy.coded_networks:
+            bits += (e.network_bits + CODED_WEIGHT_BITS) * sum(p.numel() for p in network.parameters())
         return int(bits / 8)
 
     @torch.no_grad()
