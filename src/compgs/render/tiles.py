@@ -27,6 +27,7 @@ f32 = np.float32
 ZERO, HALF, ONE = f32(0), f32(0.5), f32(1)
 MOMENTS = 9  # gradient sums of a splat in a tile: alpha, d (2), d d^T (3), color (3)
 ENTRIES_PER_CHECK = 16  # between two tests whether a tile is finished
+STRIDE = 16  # tiles; threads get runs of turns, and a run of neighbouring tiles may hold most of the splats
 
 U = np.uint64
 WIDTH = U(TILE_WIDTH)
@@ -52,12 +53,28 @@ def exp2_minus(q):
     return p * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
 
 
+@njit(inline="always")
+def turns(tiles):
+    return (tiles + STRIDE - 1) // STRIDE * STRIDE
+
+
+@njit(inline="always")
+def tile_at(turn, tiles):
+    """Every STRIDE-th tile, then the next such series: each thread's share is spread over the image."""
+    series = (tiles + STRIDE - 1) // STRIDE
+    return turn % series * STRIDE + turn // series
+
+
 @njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
 def blend_forward(packed, starts, entries, background, cutoff, cap, stop, image, transmittance, ends):
     """Fills image [H, W, 3], transmittance [H, W] and, per tile, the entry after the last one needed."""
     height, width = transmittance.shape
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    for tile in prange(starts.shape[0] - 1):
+    tiles = starts.shape[0] - 1
+    for turn in prange(turns(tiles)):
+        tile = tile_at(turn, tiles)
+        if tile >= tiles:
+            continue
         tile_y, tile_x = tile // tiles_x, tile % tiles_x
         left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
         x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
@@ -138,7 +155,11 @@ def blend_backward(
     """
     height, width = transmittance.shape
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    for tile in prange(starts.shape[0] - 1):
+    tiles = starts.shape[0] - 1
+    for turn in prange(turns(tiles)):
+        tile = tile_at(turn, tiles)
+        if tile >= tiles:
+            continue
         tile_y, tile_x = tile // tiles_x, tile % tiles_x
         left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
         x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
