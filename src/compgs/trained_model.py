@@ -4,6 +4,7 @@ Training optimizes it, the encoder turns it into a file, `as_hybrid_model` into 
 """
 
 import copy
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -70,7 +71,7 @@ class TrainedModel(nn.Module):
         rows: Tensor | None = None,  # [V] int64: anchors to look at; default all
         *,
         rate: bool = False,
-        noise: torch.Generator | None = None,
+        noise: Callable[[Tensor], Tensor] | None = None,
         stored_weights: bool = True,
         masked: bool = False,
     ) -> Quantized:

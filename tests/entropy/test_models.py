@@ -64,7 +64,17 @@ def test_minimizing_the_bits_lets_the_networks_find_a_dependence(entropy):
     optimizer = torch.optim.Adam(entropy.parameters(), 0.02)
     first = last = 0.0
     for _ in range(300):
-        bits = entropy(f, c, torch.zeros(400, 12), rate=True, noise=g).bits["covariance"].mean()
+        bits = (
+            entropy(
+                f,
+                c,
+                torch.zeros(400, 12),
+                rate=True,
+                noise=lambda x: torch.empty_like(x).uniform_(-0.5, 0.5, generator=g),
+            )
+            .bits["covariance"]
+            .mean()
+        )
         first = first or float(bits.detach())
         last = float(bits.detach())
         optimizer.zero_grad()

@@ -1,8 +1,9 @@
+import numpy as np
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compgs.entropy.quantization import quantize, quantize_weight, uniform_noise, weight_exponent
+from compgs.entropy.quantization import UniformNoise, quantize, quantize_weight, weight_exponent
 
 
 def test_quantized_latents_differ_from_the_mean_by_whole_steps():
@@ -31,9 +32,18 @@ def test_stored_weights_are_integers_of_that_many_bits(bits, spread, seed):
         assert float(weight.abs().max()) * 2.0 ** (exponent + 1) > (1 << (bits - 1)) - 2
 
 
-def test_noise_is_uniform_over_one_step_and_repeats_with_its_generator():
-    like = torch.empty(10_000)
-    noise = uniform_noise(like, torch.Generator().manual_seed(1))
-    assert noise.min() >= -0.5 and noise.max() <= 0.5
-    assert abs(float(noise.mean())) < 0.02 and abs(float(noise.var()) - 1 / 12) < 0.003
-    assert torch.equal(noise, uniform_noise(like, torch.Generator().manual_seed(1)))
+def test_noise_is_uniform_over_one_step_and_repeats_with_its_seeds():
+    def draw(seed):
+        noise = UniformNoise(1, np.random.default_rng(seed))
+        return noise(torch.empty(100, 70)), noise(torch.empty(100, 70))
+
+    first, second = draw(0)
+    assert first.shape == (100, 70) and not torch.equal(first, second)
+    assert first.min() >= -0.5 and first.max() < 0.5
+    assert abs(float(first.mean())) < 0.02 and abs(float(first.var()) - 1 / 12) < 0.003
+    assert torch.equal(first, draw(0)[0]) and not torch.equal(first, draw(1)[0])
+
+
+def test_there_is_noise_for_any_number_of_latents():
+    many = UniformNoise(0, np.random.default_rng(0))(torch.empty(3, UniformNoise.POOL // 2))
+    assert abs(float(many.mean())) < 0.001 and many.std() > 0.28

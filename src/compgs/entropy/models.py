@@ -5,6 +5,7 @@ primitives, flattened; `z` hyperpriors. All latents are in units of their quanti
 `bits` are total bits of an anchor's row; `losses.py` alone divides them, and says by what.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy.factorized import FactorizedDensity
 from compgs.entropy.gaussian import gaussian_bits
 from compgs.entropy.network import NEGATIVE_SLOPE, EntropyNetwork
-from compgs.entropy.quantization import quantize, round_straight_through, uniform_noise
+from compgs.entropy.quantization import quantize, round_straight_through
 
 STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")
 
@@ -105,7 +106,7 @@ class EntropyModel(nn.Module):
         residuals: Tensor,  # [N, K * residual_dim] steps
         *,
         rate: bool,
-        noise: torch.Generator | None = None,
+        noise: Callable[[Tensor], Tensor] | None = None,
         network_bits: int | None = None,
         mask: Tensor | None = None,  # [N, K] bool: coupled primitives that are coded; default all
     ) -> Quantized:
@@ -144,5 +145,5 @@ def _coded_bits(x: Tensor, scale: Tensor, mask: Tensor | None) -> Tensor:
     return (bits * mask).sum(1)
 
 
-def _relax(x: Tensor, noise: torch.Generator | None) -> Tensor:
-    return x.round() if noise is None else x + uniform_noise(x, noise)
+def _relax(x: Tensor, noise: Callable[[Tensor], Tensor] | None) -> Tensor:
+    return x.round() if noise is None else x + noise(x)

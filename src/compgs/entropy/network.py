@@ -69,11 +69,14 @@ class EntropyNetwork(nn.Module):
 
     def forward(self, x: Tensor, bits: int | None = None) -> tuple[Tensor, Tensor]:
         """x [N, inputs] -> means [N, C] in quantization steps, scale indices [N, C] (see entropy.gaussian)."""
-        layers = self.layers(bits)
-        for i, (weight, bias) in enumerate(layers):
-            x = torch.addmm(bias, x, weight.t())
-            if bits is not None:
-                x = round_fixed(x)
-            if i < len(layers) - 1:
-                x = nn.functional.leaky_relu(x, NEGATIVE_SLOPE)
-        return x[:, : self.channels], x[:, self.channels :]
+
+        def affine(weight: Tensor, bias: Tensor) -> Tensor:
+            y = torch.addmm(bias, x, weight.t())
+            return y if bits is None else round_fixed(y)
+
+        *hidden, (weight, bias) = self.layers(bits)
+        for layer in hidden:
+            x = nn.functional.leaky_relu(affine(*layer), NEGATIVE_SLOPE)
+        # Means and scales by one product each: halves of one matrix would have to be copied, in both directions.
+        c = self.channels
+        return affine(weight[:c], bias[:c]), affine(weight[c:], bias[c:])

@@ -6,14 +6,36 @@ values with uniform noise (Ballé et al. 2017); both as in the authors' release.
 """
 
 import math
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 
+class _Round(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return x.round()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        return grads[0]
+
+
+class _RoundAround(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, y: Tensor, mean: Tensor) -> Tensor:
+        return (y - mean).round_().add_(mean)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        return grads[0], None
+
+
 def round_straight_through(x: Tensor) -> Tensor:
     """Nearest integer; the gradient passes as if nothing had happened."""
-    return x + (x.round() - x).detach()
+    return _Round.apply(x)
 
 
 def quantize(y: Tensor, mean: Tensor) -> Tensor:
@@ -22,14 +44,31 @@ def quantize(y: Tensor, mean: Tensor) -> Tensor:
     The gradient goes to `y` alone: a gradient into the mean would let rendering move reconstruction values that
     only the rate should choose.
     """
-    mean = mean.detach()
-    return round_straight_through(y - mean) + mean
+    return _RoundAround.apply(y, mean)
 
 
-def uniform_noise(like: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Noise in [-0.5, 0.5) that stands for rounding inside the likelihood."""
-    noise = torch.empty_like(like)
-    return noise.uniform_(-0.5, 0.5, generator=generator)
+class UniformNoise:
+    """Noise in [-0.5, 0.5) that stands for rounding inside the likelihood.
+
+    Cut at random places from a pool that is drawn once: half a million new numbers in every step would take as long
+    as the entropy networks.
+    """
+
+    POOL = 1 << 22
+
+    def __init__(self, seed: int, places: np.random.Generator, device: torch.device | str = "cpu") -> None:
+        generator = torch.Generator(device).manual_seed(seed)
+        self.pool = torch.rand(self.POOL, generator=generator, device=device) - 0.5
+        self.places = places
+
+    def __call__(self, like: Tensor) -> Tensor:
+        """Noise of the shape of `like`, to be read only."""
+        count = like.numel()
+        if count > self.POOL // 2:
+            parts = [self(part) for part in like.view(-1).split(self.POOL // 2)]
+            return torch.cat(parts).view_as(like)
+        place = int(self.places.integers(self.POOL - count + 1))
+        return self.pool[place : place + count].view(like.shape)
 
 
 def weight_exponent(weight: Tensor, bits: int) -> int:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from compgs.gaussians import Gaussians
+from compgs.model.fused import AffineTransform, SelectVisible
 from compgs.model.layers import ResidualMLP
 from compgs.model.primitives import Primitives
 
@@ -116,6 +117,16 @@ def predict(
     view = view_embedding(primitives.positions, camera_center, distance_unit)
     seen = torch.cat([primitives.references, view], 1)
     raw = call("appearance", seen, primitives.residuals, primitives.anchor_index)
+    if heads.layout == "paired" and raw.device.type == "cpu" and raw.dtype == torch.float32:
+        drawn, colors, residuals, index, opacities = SelectVisible.apply(
+            raw, primitives.residuals, OPACITY_CUTOFF
+        )
+        anchor = primitives.anchor_index[index]
+        geometry = call("geometry", primitives.references, residuals, anchor)
+        means, scales, quaternions = AffineTransform.apply(
+            geometry, primitives.positions, primitives.log_scales, anchor, primitives.voxel_size
+        )
+        return Prediction(Gaussians(means, quaternions, scales, drawn, colors), index, opacities)
     opacities = torch.tanh(raw[:, 0])
     index = torch.nonzero(opacities.detach() > OPACITY_CUTOFF).view(-1)
     anchor = primitives.anchor_index[index]

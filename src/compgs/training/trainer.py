@@ -13,6 +13,7 @@ from torch import Tensor
 from compgs.cameras import Camera
 from compgs.config import Config, check_config, load_config
 from compgs.entropy import Quantized
+from compgs.entropy.quantization import UniformNoise
 from compgs.errors import CheckpointError, ConfigError, TrainingError
 from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer
 from compgs.model.prediction import OPACITY_CUTOFF, Prediction, predict
@@ -107,8 +108,9 @@ class Trainer:
         self.optimizer = make_optimizer(self.model, config.training)
         self.schedule = make_schedule(config.control, config.training.steps, len(scene.train_views))
         self.control = AdaptiveControl(config, self.schedule, self.model.anchors, device)
-        self.noise = torch.Generator(device).manual_seed(config.training.seed + 1)
+        self.chance = torch.Generator(device).manual_seed(config.training.seed + 1)  # of growth
         self.shuffle = np.random.default_rng(config.training.seed + 2)
+        self.noise = UniformNoise(config.training.seed + 3, self.shuffle, device)
         self.order: list[int] = []
         self.targets: dict[int, Target] = {}
         self.settings = RasterSettings(background=scene.background)
@@ -170,7 +172,7 @@ class Trainer:
             if gradient is not None:
                 self.control.observe(rows, prediction, gradient, view.camera)
             if self.schedule.due(self.step):
-                self.control.act(self.model, self.optimizer, self.coupled_means(), self.noise)
+                self.control.act(self.model, self.optimizer, self.coupled_means(), self.chance)
             profile.lap("control")
         profile.end()
         self.step += 1
@@ -233,8 +235,8 @@ class Trainer:
     def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         t = self.config.training
-        saved = started = time.perf_counter()
-        first, estimate = self.step, 0
+        saved = reported = time.perf_counter()
+        estimate, pace, counted = 0, 0.0, self.step
         try:
             while self.step < t.steps:
                 result = self.train_step()
@@ -242,7 +244,10 @@ class Trainer:
                 if on_progress and (self.step % REPORT_EVERY == 0 or self.step == t.steps):
                     if self.step % ESTIMATE_EVERY == 0 or not estimate:
                         estimate = self.estimated_bytes()
-                    pace = (now - started) / (self.step - first)
+                    recent = (now - reported) / (self.step - counted)
+                    # Smoothed, but not for long: the first steps compile kernels and say nothing of the rest.
+                    pace = recent if not pace or recent < 0.5 * pace else 0.9 * pace + 0.1 * recent
+                    reported, counted = now, self.step
                     on_progress(self.status(result, estimate, pace))
                 if self.step % REPORT_EVERY == 0 and not np.isfinite(result.loss):
                     raise TrainingError(
@@ -294,7 +299,7 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
-        extra["noise"] = self.noise.get_state()
+        extra["chance"] = self.chance.get_state()
         state = {
             "step": self.step,
             "order": self.order,
@@ -323,7 +328,7 @@ class Trainer:
         restore_optimizer(trainer.model, trainer.optimizer, checkpoint.optimizer)
         for name in AdaptiveControl.STATISTICS:
             setattr(trainer.control, name, checkpoint.extra[f"control/{name}"].to(device))
-        trainer.noise.set_state(checkpoint.extra["noise"])
+        trainer.chance.set_state(checkpoint.extra["chance"])
         trainer.shuffle.bit_generator.state = checkpoint.state["shuffle"]
         trainer.order = checkpoint.state["order"]
         trainer.step = checkpoint.state["step"]
