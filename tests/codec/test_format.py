@@ -8,14 +8,25 @@ from pathlib import Path
 import pytest
 
 from compgs.codec import fields, format, integer_network, rans, sections, tables, weights
-from compgs.codec.format import REQUIRED, SECTION_NAMES, Section, container_bytes, pack, unpack
+from compgs.codec.format import (
+    POSITIONS,
+    POSITIONS_GPCC,
+    REQUIRED,
+    SECTION_NAMES,
+    Section,
+    container_bytes,
+    pack,
+    unpack,
+)
 from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile, TruncatedSection, UnsupportedVersion
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "bitstream.md"
 
+PRESENT = sorted((*REQUIRED, POSITIONS))  # sections of the smallest file
+
 
 def some_file(extra: list[Section] | None = None) -> bytes:
-    return pack([Section(n, bytes([n]) * (n * 3)) for n in REQUIRED] + (extra or []))
+    return pack([Section(n, bytes([n]) * (n * 3)) for n in PRESENT] + (extra or []))
 
 
 def with_header(data: bytes, **changes: int) -> bytes:
@@ -32,7 +43,7 @@ def with_header(data: bytes, **changes: int) -> bytes:
 def test_sections_come_back() -> None:
     extra = [Section(0x81, b"hello"), Section(0xFE, b"from the future")]
     read = unpack(some_file(extra))
-    assert [(s.number, s.data) for s in read] == [(n, bytes([n]) * (n * 3)) for n in REQUIRED] + [
+    assert [(s.number, s.data) for s in read] == [(n, bytes([n]) * (n * 3)) for n in PRESENT] + [
         (s.number, s.data) for s in extra
     ]
 
@@ -88,7 +99,7 @@ def test_absurd_headers_are_refused(
 
 def test_missing_and_left_over_parts_are_refused() -> None:
     with pytest.raises(CorruptSection, match="'residual embeddings' is missing"):
-        unpack(pack([Section(n, b"") for n in REQUIRED[:-1]]))
+        unpack(pack([Section(n, b"") for n in PRESENT[:-1]]))
     with pytest.raises(CorruptSection, match="3 bytes are left over"):
         unpack(some_file() + b"abc")
     with pytest.raises(CorruptSection, match="64"):
@@ -134,5 +145,12 @@ def test_document_and_code_agree_on_the_constants() -> None:
 def test_document_names_every_section_with_its_number() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     for number, name in SECTION_NAMES.items():
-        assert re.search(rf"^\| {number} \| {name} \|", text, re.MULTILINE), name
+        assert re.search(rf"^\| {number} \| {re.escape(name)} \|", text, re.MULTILINE), name
     assert f"Version {format.VERSION}" in text
+
+
+def test_positions_come_in_exactly_one_section() -> None:
+    for numbers in (REQUIRED, sorted((*PRESENT, POSITIONS_GPCC))):
+        with pytest.raises(CorruptSection, match="one section of positions"):
+            unpack(pack([Section(n, b"") for n in numbers]))
+    unpack(pack([Section(n, b"") for n in sorted((*REQUIRED, POSITIONS_GPCC))]))

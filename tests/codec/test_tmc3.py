@@ -11,7 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from compgs.codec.anchor_order import canonical_order
+from compgs.codec.reader import file_info, read_content
 from compgs.codec.tmc3 import ENCODER_OPTIONS, decode_positions_tmc3, encode_positions_tmc3
+from compgs.codec.writer import write_content
 from compgs.errors import CorruptSection, MissingDependency, NotEncodable
 
 # Stores the points as they are, but backwards: TMC13 has an order of its own.
@@ -133,6 +135,21 @@ def test_duplicates_are_refused_before_the_program_runs(
     install(monkeypatch, tmp_path, fail="must not run")
     with pytest.raises(NotEncodable, match="duplicates"):
         encode_positions_tmc3(np.zeros((2, 3), np.int32))
+
+
+def test_a_file_with_g_pcc_positions_holds_the_same_scene(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    golden = sorted((Path(__file__).parents[1] / "golden").glob("*.cgs"))[0].read_bytes()
+    content = read_content(golden)
+    with pytest.raises(MissingDependency, match="tmc3"):
+        monkeypatch.setenv("PATH", str(tmp_path))
+        write_content(content, "tmc3")
+    monkeypatch.undo()
+    install(monkeypatch, tmp_path)
+    data = write_content(content, "tmc3")
+    assert "positions (G-PCC)" in {section.name for section in file_info(data).sections}
+    assert write_content(read_content(data)) == golden
 
 
 @pytest.mark.skipif(shutil.which("tmc3") is None, reason="tmc3 (TMC13) is not on PATH")

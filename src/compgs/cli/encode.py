@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
@@ -31,6 +31,10 @@ class Encode(ComputingCommand):
     ] = None
     """The file to write."""
 
+    geometry: Literal["octree", "tmc3"] = "octree"
+    """Anchor positions by the octree coder (smaller), or by G-PCC as in the paper: then `tmc3` must be on PATH, also
+    where the file is decoded."""
+
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace a file that is there already."""
 
@@ -49,7 +53,7 @@ class Encode(ComputingCommand):
         model = load_run(self.folder)
         path.parent.mkdir(parents=True, exist_ok=True)
         start = time.perf_counter()
-        encoded = encode(model, path, overwrite=self.overwrite)
+        encoded = encode(model, path, overwrite=self.overwrite, geometry=self.geometry)
         say(f"{path}: {size(encoded.bytes)}, encoded in {duration(time.perf_counter() - start)}")
         sections = file_info(path.read_bytes()).sections
         print_components({s.name: s.bytes for s in sections}, encoded.anchors, encoded.coupled)

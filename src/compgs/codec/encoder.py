@@ -17,7 +17,7 @@ from compgs.codec.content import Dimensions, FileContent
 from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork, evaluate
 from compgs.codec.tables import hyper_tables
 from compgs.codec.weights import QuantizedTensor
-from compgs.codec.writer import write_content
+from compgs.codec.writer import Geometry, write_content
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import NotEncodable
@@ -37,16 +37,19 @@ class EncodedFile:
     coupled: int
 
 
-def encode(model: TrainedModel, path: str | Path, *, overwrite: bool = False) -> EncodedFile:
+def encode(
+    model: TrainedModel, path: str | Path, *, overwrite: bool = False, geometry: Geometry = "octree"
+) -> EncodedFile:
     """Write a trained model to a .cgs file; the file appears whole or not at all.
 
+    `geometry`: anchor positions by the octree coder, or as in the paper by G-PCC, where its program `tmc3` is on PATH.
     Raises NotEncodable for a model that the format cannot represent, OutputError if the file exists (unless
     `overwrite`) or cannot be written.
     """
     path = Path(path)
     check_output_file(path, overwrite=overwrite)
     content = to_content(model)
-    data = write_content(content)
+    data = write_content(content, geometry)
     write_bytes(path, data)
     return EncodedFile(path, len(data), len(content.coordinates), int(content.mask.sum()))
 

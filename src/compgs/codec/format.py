@@ -29,6 +29,7 @@ REFERENCE = 8
 COVARIANCE = 9
 RESIDUAL_HYPER = 10
 RESIDUAL = 11
+POSITIONS_GPCC = 12  # in place of POSITIONS
 METADATA = OPTIONAL | 1
 PADDING = OPTIONAL | 2
 
@@ -44,10 +45,13 @@ SECTION_NAMES = {
     COVARIANCE: "covariance",
     RESIDUAL_HYPER: "residual hyperprior",
     RESIDUAL: "residual embeddings",
+    POSITIONS_GPCC: "positions (G-PCC)",
     METADATA: "metadata",
     PADDING: "padding",
 }
-REQUIRED = tuple(number for number in SECTION_NAMES if not number & OPTIONAL)
+REQUIRED = tuple(
+    number for number in SECTION_NAMES if not number & OPTIONAL and number not in (POSITIONS, POSITIONS_GPCC)
+)
 
 # Limits of what a file may hold; a decoder checks them, and the lengths, before it allocates.
 MAX_ANCHORS = 1 << 24
@@ -143,8 +147,8 @@ def unpack(data: bytes) -> list[Section]:
 
 
 def _check_table(numbers: list[int]) -> None:
-    """All required sections, each once, in order; optional ones behind them, each once; no unknown required
-    ones.
+    """All required sections and one of the positions, each once, in order; optional ones behind them, each once; no
+    unknown required ones.
     """
     for number in numbers:
         if not number & OPTIONAL and number not in SECTION_NAMES:
@@ -156,3 +160,5 @@ def _check_table(numbers: list[int]) -> None:
     missing = [SECTION_NAMES[number] for number in REQUIRED if number not in numbers]
     if missing:
         raise CorruptSection(f"header: the section {missing[0]!r} is missing")
+    if (POSITIONS in numbers) == (POSITIONS_GPCC in numbers):
+        raise CorruptSection("header: expected one section of positions, 2 or 12")

@@ -25,6 +25,7 @@ from compgs.codec.format import (
     NETWORKS,
     PADDING,
     POSITIONS,
+    POSITIONS_GPCC,
     REFERENCE,
     REFERENCE_HYPER,
     RESIDUAL,
@@ -42,6 +43,7 @@ from compgs.codec.octree import decode_positions
 from compgs.codec.rans import decode_symbols
 from compgs.codec.sections import SceneSection, decode_hyper_tables, decode_metadata, decode_scene
 from compgs.codec.tables import FrequencyTables, channel_tables, gaussian_tables
+from compgs.codec.tmc3 import decode_positions_tmc3
 from compgs.codec.weights import decode_heads, decode_networks
 from compgs.errors import CorruptSection
 
@@ -103,7 +105,10 @@ def read_latents(data: bytes) -> tuple[FileContent, Latents]:
     residual_hyper_tables = hyper_tables[d.reference_hyper_dim :]
     networks = decode_networks(sections[NETWORKS], SECTION_NAMES[NETWORKS], d.network_sizes())
     heads = decode_heads(sections[HEADS], SECTION_NAMES[HEADS])
-    coordinates = decode_positions(sections[POSITIONS], scene.anchors)
+    if POSITIONS in sections:
+        coordinates = decode_positions(sections[POSITIONS], scene.anchors)
+    else:
+        coordinates = decode_positions_tmc3(sections[POSITIONS_GPCC], scene.anchors)
     mask = decode_masks(sections[MASKS], scene.anchors, d.coupled_primitives)
     coupled = int(mask.sum())
     if coupled != scene.coupled:

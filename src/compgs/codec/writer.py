@@ -1,6 +1,7 @@
 """Integers become bytes: the mirror image of reader.py, section by section."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from compgs.codec.format import (
     NETWORKS,
     PADDING,
     POSITIONS,
+    POSITIONS_GPCC,
     REFERENCE,
     REFERENCE_HYPER,
     RESIDUAL,
@@ -59,16 +61,21 @@ from compgs.codec.tables import (
     channel_tables,
     gaussian_tables,
 )
+from compgs.codec.tmc3 import encode_positions_tmc3
 from compgs.codec.weights import NETWORKS as NETWORK_NAMES
 from compgs.codec.weights import encode_heads, encode_networks
 from compgs.errors import NotEncodable
 
+Geometry = Literal["octree", "tmc3"]
 
-def write_content(content: FileContent) -> bytes:
+
+def write_content(content: FileContent, geometry: Geometry = "octree") -> bytes:
     """The bytes of a .cgs file. Anchors may come in any order; the file has them in the canonical one.
 
-    Raises NotEncodable if the format cannot represent the content. Symbols of coupled primitives that do not
-    exist are ignored.
+    `geometry`: positions by the octree coder, or as in the paper by G-PCC, whose program `tmc3` writer and reader then
+    need. Symbols of coupled primitives that do not exist are ignored.
+
+    Raises MissingDependency without that program, NotEncodable if the format cannot represent the content.
     """
     check_content(content)
     content = _reordered(content, canonical_order(content.coordinates))
@@ -82,7 +89,7 @@ def write_content(content: FileContent) -> bytes:
 
     sections = [
         Section(SCENE, encode_scene(content)),
-        Section(POSITIONS, encode_positions(content.coordinates)),
+        _positions(content.coordinates, geometry),
         Section(MASKS, encode_masks(content.mask)),
         Section(
             HYPER_TABLES, encode_hyper_tables(content.reference_hyper_tables + content.residual_hyper_tables)
@@ -108,8 +115,15 @@ def write_content(content: FileContent) -> bytes:
 
     if content.metadata:
         sections.append(Section(METADATA, encode_metadata(content.metadata)))
+    sections.sort(key=lambda section: section.number)
     padding = _padding(content, sections)
     return pack([*sections, Section(PADDING, bytes(padding))] if padding else sections)
+
+
+def _positions(coordinates: np.ndarray, geometry: Geometry) -> Section:
+    if geometry == "octree":
+        return Section(POSITIONS, encode_positions(coordinates))
+    return Section(POSITIONS_GPCC, encode_positions_tmc3(coordinates))
 
 
 def check_content(content: FileContent) -> None:

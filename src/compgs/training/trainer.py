@@ -265,7 +265,7 @@ class Trainer:
             self.save(path)
 
     def status(self, result: StepResult, estimate: int, pace: float) -> TrainingStatus:
-        photograph = torch.as_tensor(result.view.image, device=result.image.device).float() / 255.0
+        photograph = torch.tensor(result.view.image, device=result.image.device) / 255.0
         error = float(((result.image.clamp(0, 1) - photograph) ** 2).mean())
         psnr = -10.0 * float(np.log10(max(error, 1e-10)))
         return TrainingStatus(
