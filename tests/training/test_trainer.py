@@ -1,9 +1,11 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from compgs.errors import ConfigError
+from compgs.errors import ConfigError, TrainingError
+from compgs.scene.views import View
 from compgs.training import train
 from compgs.training.trainer import Trainer
 
@@ -63,6 +65,25 @@ def test_primitives_that_no_view_sees_are_dropped_at_the_end(blob_scene, tiny_co
     assert mask.any() and mask.shape == (trainer.model.anchors, 4)
     hybrid = trainer.model.as_hybrid_model()
     assert hybrid.coupled == int(mask.sum())
+
+
+def away(view: View) -> View:
+    """The same view from a camera far off that has turned its back on the scene."""
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ view.camera.world_to_camera
+    turned[2, 3] -= 100.0
+    return replace(view, camera=replace(view.camera, world_to_camera=turned))
+
+
+def test_a_view_that_no_anchor_is_in_is_passed_over(blob_scene, tiny_config):
+    first, *rest = blob_scene.train_views
+    model = train(replace(blob_scene, train_views=(away(first), *rest)), tiny_config)
+    assert torch.isfinite(model.references).all()
+
+
+def test_views_that_all_look_elsewhere_are_an_error_before_any_step(blob_scene, tiny_config):
+    scene = replace(blob_scene, train_views=tuple(away(view) for view in blob_scene.train_views))
+    with pytest.raises(TrainingError, match="poses"):
+        train(scene, tiny_config)
 
 
 def test_no_training_views_is_a_settings_error(blob_scene, tiny_config):

@@ -130,9 +130,7 @@ class Trainer:
 
         rows = self.visible_anchors(view.camera)
         if len(rows) == 0:
-            raise TrainingError(
-                f"step {self.step}: no anchor is visible in {view.name}; are the poses right?"
-            )
+            return self.skip(view)
         profile.lap("culling")
         latents = self.model.quantized(
             rows, rate=progress >= t.rate_start, noise=self.noise, stored_weights=stored
@@ -177,6 +175,12 @@ class Trainer:
         profile.end()
         self.step += 1
         return StepResult(float(loss.detach()), rendered.image.detach(), view)
+
+    def skip(self, view: View) -> StepResult:
+        """A step on a view that no anchor is in: nothing can be learned from it."""
+        self.step += 1
+        background = torch.tensor(self.scene.background, device=self.device)
+        return StepResult(0.0, background.expand(*view.image.shape), view)
 
     def next_view(self) -> int:
         """Every view once in random order, then again."""
@@ -235,6 +239,10 @@ class Trainer:
     def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         t = self.config.training
+        if not any(len(self.visible_anchors(view.camera)) for view in self.scene.train_views):
+            raise TrainingError(
+                f"{self.scene.name}: no view sees any of the scene's points; are the poses right?"
+            )
         saved = reported = time.perf_counter()
         estimate, pace, counted = 0, 0.0, self.step
         try:
