@@ -32,7 +32,7 @@ class ComputingCommand(Command):
     """A command that computes for a while."""
 
     threads: Annotated[int | None, arg(metavar="N", help_behavior_hint=NO_DEFAULT)] = None
-    """Threads to use; all cores by default. Results do not depend on it, times do."""
+    """Threads to use; all cores by default. What a file decodes to does not depend on it; a training may, in the last bits."""
 
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint=NO_DEFAULT)] = None
     """Where to compute; a CUDA GPU by default where there is one."""

@@ -36,9 +36,11 @@ def from_latents(content: FileContent, latents: Latents, device: torch.device) -
     scale = 2.0**-FRACTION_BITS
 
     def floats(fixed: np.ndarray, step: float) -> torch.Tensor:
-        return torch.from_numpy(fixed.astype(np.float32) * np.float32(scale * step)).to(device)
+        values = fixed.astype(np.float32)
+        values *= np.float32(scale * step)  # in place: decoding stays below three times the size of the model
+        return torch.from_numpy(values).to(device)
 
-    anchor_index, _ = np.nonzero(content.mask)
+    anchor_index = np.repeat(np.arange(len(content.mask)), content.mask.sum(1))
     heads = PredictionHeads(d.reference_dim, d.residual_dim, d.width, d.heads)
     stored = dict(content.heads)
     expected = {name: p.shape for name, p in heads.named_parameters()}
@@ -61,7 +63,7 @@ def from_latents(content: FileContent, latents: Latents, device: torch.device) -
         log_scales=floats(latents.covariance, content.covariance_step),
         references=floats(latents.reference, content.reference_step),
         residuals=floats(latents.residual, content.residual_step),
-        anchor_index=torch.from_numpy(anchor_index.astype(np.int64)).to(device),
+        anchor_index=torch.from_numpy(anchor_index).to(device),
         voxel_size=content.voxel_size,
     )
     return HybridModel(

@@ -1,10 +1,11 @@
 """A scene that can be rendered: what a decoded file holds, and what training hands over."""
 
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
@@ -13,6 +14,8 @@ from compgs.model.primitives import Primitives
 
 # An opaque splat falls below 1/255 at sqrt(2 ln 255) = 3.33 standard deviations.
 CUTOFF_SIGMAS = 3.34
+# Anchors are worked on in blocks, so that memory stays near the size of the result.
+BLOCK = 1 << 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,58 +41,86 @@ class HybridModel:
         return len(self.primitives.residuals)
 
     @functools.cached_property
+    def first_coupled(self) -> Tensor:
+        """[N + 1] int64: where the coupled primitives of each anchor begin, and where the last one's end."""
+        counts = torch.bincount(self.primitives.anchor_index, minlength=self.anchors)
+        return nn.functional.pad(counts.cumsum(0), (1, 0))
+
+    def _blocks(self) -> Iterator[tuple[slice, slice]]:
+        """All anchors, BLOCK at a time, and their coupled primitives."""
+        starts = self.first_coupled[::BLOCK].tolist()
+        for i, start in enumerate(starts):
+            end = starts[i + 1] if i + 1 < len(starts) else self.coupled
+            yield slice(i * BLOCK, min((i + 1) * BLOCK, self.anchors)), slice(start, end)
+
+    @functools.cached_property
     def geometry(self) -> tuple[Tensor, Tensor, Tensor]:
         """Means, scales [P, 3] and quaternions [P, 4] of all coupled primitives, world units."""
         p = self.primitives
-        means, scales, quaternions = [], [], []
+        means, scales, quaternions = (p.positions.new_empty(self.coupled, size) for size in (3, 3, 4))
         with torch.no_grad():
-            # In blocks, so that the peak stays near the size of the result.
-            for index, residuals in zip(
-                p.anchor_index.split(1 << 18), p.residuals.split(1 << 18), strict=True
-            ):
-                first, last = (int(index[0]), int(index[-1]) + 1) if len(index) else (0, 0)
-                raw = self.heads("geometry", p.references[first:last], residuals, index - first)
-                m, s, q = affine_transform(raw, p.positions[index], p.offset_scales[index], p.sizes[index])
-                means.append(m)
-                scales.append(s)
-                quaternions.append(q)
-        return torch.cat(means), torch.cat(scales), torch.cat(quaternions)
+            offset_scales, sizes = p.offset_scales, p.sizes
+            for anchors, coupled in self._blocks():
+                index = p.anchor_index[coupled]
+                raw = self.heads(
+                    "geometry", p.references[anchors], p.residuals[coupled], index - anchors.start
+                )
+                means[coupled], scales[coupled], quaternions[coupled] = affine_transform(
+                    raw,
+                    p.positions.index_select(0, index),
+                    offset_scales.index_select(0, index),
+                    sizes.index_select(0, index),
+                )
+        return means, scales, quaternions
 
     @functools.cached_property
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Spheres that hold an anchor's coupled primitives: centres [N, 3] and radii [N], world units."""
         p = self.primitives
         means, scales, _ = self.geometry
-        reach = (means - p.positions[p.anchor_index]).norm(dim=1) + CUTOFF_SIGMAS * scales.amax(1)
-        radii = torch.zeros(len(p), device=means.device).scatter_reduce_(0, p.anchor_index, reach, "amax")
+        radii = means.new_zeros(len(p))
+        for _, coupled in self._blocks():
+            index = p.anchor_index[coupled]
+            offset = means[coupled] - p.positions.index_select(0, index)
+            reach = offset.norm(dim=1) + CUTOFF_SIGMAS * scales[coupled].amax(1)
+            radii.scatter_reduce_(0, index, reach, "amax")
         return p.positions, radii
 
+    @torch.no_grad()
     def gaussians(self, camera: Camera, visible: Tensor | None = None) -> Gaussians:
         """What a camera sees. `visible` [N] bool: anchors to look at; all of them if not given."""
         p = self.primitives
-        means, scales, quaternions = self.geometry
-        with torch.no_grad():
-            if visible is None:
-                visible = torch.ones(len(p), dtype=torch.bool, device=p.positions.device)
-            anchors = torch.nonzero(visible).view(-1)
-            chosen = torch.nonzero(visible[p.anchor_index]).view(-1)
-            rows = (torch.cumsum(visible, 0) - 1)[p.anchor_index[chosen]]
-            center = torch.as_tensor(camera.center, dtype=p.positions.dtype, device=p.positions.device)
-            view = view_embedding(p.positions[anchors], center, self.distance_unit)
-            seen = torch.cat([p.references[anchors], view], 1)
-            residuals = p.residuals[chosen]
-            raw = self.heads("appearance", seen, residuals, rows)
-            opacities = torch.tanh(raw[:, 0])
-            drawn = torch.nonzero(opacities > OPACITY_CUTOFF).view(-1)
-            if self.heads.layout == "paired":
-                color = raw[drawn, 1:4]
-            else:
-                color = self.heads("color", seen, residuals[drawn], rows[drawn])
-            primitive = chosen[drawn]
-            return Gaussians(
-                means[primitive],
-                quaternions[primitive],
-                scales[primitive],
-                opacities[drawn],
-                torch.sigmoid(color),
-            )
+        center = torch.as_tensor(camera.center, dtype=p.positions.dtype, device=p.positions.device)
+        if visible is None:
+            chosen = torch.arange(len(p), device=p.positions.device)
+        else:
+            chosen = torch.nonzero(visible).view(-1)
+        parts = [self._appearance(anchors, center) for anchors in chosen.split(BLOCK)]
+        drawn, opacities, colors = (torch.cat(part) for part in zip(*parts, strict=True))
+        means, scales, quaternions = (array.index_select(0, drawn) for array in self.geometry)
+        return Gaussians(means, quaternions, scales, opacities, colors)
+
+    def _appearance(
+        self,
+        anchors: Tensor,  # [V] int64, ascending
+        center: Tensor,  # [3] of the camera, world units
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the anchors' coupled primitives that are drawn: which they are [M], opacities [M], colors [M, 3]."""
+        p = self.primitives
+        first = self.first_coupled.index_select(0, anchors)
+        counts = self.first_coupled.index_select(0, anchors + 1) - first
+        rows = torch.repeat_interleave(counts)  # of `anchors`, one for each coupled primitive
+        # The anchors' ranges of coupled primitives, one after the other.
+        coupled = torch.arange(len(rows), device=rows.device)
+        coupled += (first + counts - counts.cumsum(0)).index_select(0, rows)
+        view = view_embedding(p.positions.index_select(0, anchors), center, self.distance_unit)
+        seen = torch.cat([p.references.index_select(0, anchors), view], 1)
+        residuals = p.residuals.index_select(0, coupled)
+        raw = self.heads("appearance", seen, residuals, rows)
+        opacities = torch.tanh(raw[:, 0])
+        drawn = torch.nonzero(opacities > OPACITY_CUTOFF).view(-1)
+        if self.heads.layout == "paired":
+            color = raw.index_select(0, drawn)[:, 1:4]
+        else:
+            color = self.heads("color", seen, residuals.index_select(0, drawn), rows.index_select(0, drawn))
+        return coupled.index_select(0, drawn), opacities.index_select(0, drawn), torch.sigmoid(color)
