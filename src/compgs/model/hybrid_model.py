@@ -48,7 +48,7 @@ class HybridModel:
 
     def _blocks(self) -> Iterator[tuple[slice, slice]]:
         """All anchors, BLOCK at a time, and their coupled primitives."""
-        starts = self.first_coupled[::BLOCK].tolist()
+        starts = self.first_coupled[:-1:BLOCK].tolist()
         for i, start in enumerate(starts):
             end = starts[i + 1] if i + 1 < len(starts) else self.coupled
             yield slice(i * BLOCK, min((i + 1) * BLOCK, self.anchors)), slice(start, end)
