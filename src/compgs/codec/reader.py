@@ -139,6 +139,7 @@ def read_latents(data: bytes) -> tuple[FileContent, Latents]:
     context = residual_context(residual_hyper, reference_latents)
     means, index = entropy_parameters(networks["residual"], context, mask)
     symbols = stream(RESIDUAL, index, gaussian)
+    del context, index  # the peak of memory comes next
     residual = scatter_existing(symbols, mask)
     residual_latents = reconstruct(symbols, means)
 
