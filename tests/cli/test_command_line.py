@@ -9,6 +9,7 @@ import pytest
 from compgs import __version__
 from compgs.cli.main import COMMANDS, command_name, main
 
+GOLDEN_FILE = Path(__file__).parent.parent / "golden" / "tiny.cgs"
 NAMES = [command_name(command) for command in COMMANDS]
 
 
@@ -93,14 +94,17 @@ def test_usage_errors_exit_with_2(
         (["train", "nowhere", "-o", "file"], "file"),
         (["encode", "nowhere"], "nowhere"),
         (["encode", "full", "-o", "file"], "overwrite"),
-        (["encode", "empty", "-o", "out.cgs"], "checkpoint"),
+        (["encode", "empty", "-o", "out.cgs"], "checkpoint.safetensors"),
         (["decode", "nowhere.cgs"], "nowhere.cgs"),
         (["decode", "empty"], "folder"),
-        (["decode", "file", "-o", "full"], "overwrite"),
+        (["decode", "file", "-o", "out"], "file: header"),
+        (["decode", "GOLDEN", "-o", "full"], "overwrite"),
         (["render", "nowhere.cgs", "-o", "out"], "nowhere.cgs"),
-        (["render", "file", "-o", "full"], "overwrite"),
+        (["render", "file", "-o", "out"], "file: header"),
+        (["render", "GOLDEN", "-o", "full"], "overwrite"),
         (["evaluate", "nowhere.cgs", "scene"], "nowhere.cgs"),
-        (["evaluate", "file", "scene", "-o", "full"], "overwrite"),
+        (["evaluate", "file", "scene"], "file: header"),
+        (["evaluate", "GOLDEN", "scene", "-o", "full"], "overwrite"),
         (["info", "empty"], "folder"),
         (["info", "file"], "file"),
         (["info", "full"], "full/run.cgs"),
@@ -121,6 +125,7 @@ def test_wrong_input_is_one_clear_line_and_nothing_is_written(
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "run.cgs").write_bytes(b"precious")
     (tmp_path / "file").write_bytes(b"something else")
+    (tmp_path / "GOLDEN").write_bytes(GOLDEN_FILE.read_bytes())
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
     code, _, err = outcome(capsys, *arguments)
@@ -135,13 +140,28 @@ def test_wrong_input_is_one_clear_line_and_nothing_is_written(
     assert not (tmp_path / "run").exists()
 
 
+def test_a_damaged_file_is_refused_before_the_scene_is_read(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    damaged = bytearray(GOLDEN_FILE.read_bytes())
+    damaged[-1] ^= 1
+    (tmp_path / "a.cgs").write_bytes(damaged)
+    for command in ("evaluate", "render"):
+        code, _, err = outcome(
+            capsys, command, tmp_path / "a.cgs", tmp_path / "nowhere", "-o", tmp_path / "out"
+        )
+        assert code == 1
+        assert "a.cgs: metadata: its checksum does not match" in err
+        assert not (tmp_path / "out").exists()
+
+
 def test_debug_shows_where_an_error_came_from(tmp_path: Path) -> None:
     with pytest.raises(Exception, match="there is no such file"):
         main(["info", str(tmp_path / "nowhere.cgs"), "--debug"])
 
 
 def test_a_device_that_is_not_there_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    (tmp_path / "a.cgs").touch()
+    (tmp_path / "a.cgs").write_bytes(GOLDEN_FILE.read_bytes())
     code, _, err = outcome(capsys, "decode", tmp_path / "a.cgs", "--device", "tpu")
     assert code == 2
     assert "cpu or cuda" in err
@@ -154,7 +174,7 @@ def test_a_device_that_is_not_there_is_refused(capsys: pytest.CaptureFixture[str
 def test_thread_counts_that_are_not_there_are_refused(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, threads: str
 ) -> None:
-    (tmp_path / "a.cgs").touch()
+    (tmp_path / "a.cgs").write_bytes(GOLDEN_FILE.read_bytes())
     code, _, err = outcome(capsys, "decode", tmp_path / "a.cgs", "--threads", threads)
     assert code == 2
     assert "expected 1 to" in err

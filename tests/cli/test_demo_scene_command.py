@@ -29,3 +29,15 @@ def test_a_folder_that_holds_more_than_a_scene_is_never_removed(
     assert main(["demo-scene", str(tmp_path), *SMALL, "--overwrite"]) == 1
     assert "thesis.txt" in capsys.readouterr().err
     assert (tmp_path / "thesis.txt").read_text() == "precious"
+
+
+def test_photographs_of_somebody_are_never_removed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photograph = tmp_path / "images" / "IMG_0001.JPG"
+    photograph.parent.mkdir()
+    (tmp_path / "sparse").mkdir()
+    photograph.write_bytes(b"precious")
+    assert main(["demo-scene", str(tmp_path), *SMALL, "--overwrite"]) == 1
+    assert "IMG_0001.JPG" in capsys.readouterr().err
+    assert photograph.read_bytes() == b"precious"

@@ -44,6 +44,13 @@ def test_photographs_without_poses_are_refused_with_the_command_that_helps(tmp_p
         load_scene(tmp_path)
 
 
+def test_the_command_that_helps_quotes_folders_with_spaces(tmp_path: Path) -> None:
+    folder = tmp_path / "my garden"
+    (folder / "images").mkdir(parents=True)
+    with pytest.raises(MissingSparseModel, match=r"--workspace_path '.*my garden' --image_path"):
+        load_scene(folder)
+
+
 def test_a_missing_points_file_is_refused(write_capture: Write) -> None:
     folder = write_capture()
     (folder / "sparse" / "0" / "points3D.bin").unlink()
@@ -100,6 +107,13 @@ def test_a_position_that_is_not_finite_is_named(write_capture: Write) -> None:
     folder = write_capture()
     rewrite_images(folder, lambda image: replace(image, translation=np.array([0.0, np.nan, 0.0])))
     with pytest.raises(UnsupportedCamera, match=r"04\.png.*translation"):
+        load_scene(folder)
+
+
+def test_a_position_beyond_single_precision_is_named(write_capture: Write) -> None:
+    folder = write_capture()
+    rewrite_images(folder, lambda image: replace(image, translation=np.array([0.0, 1e200, 0.0])))
+    with pytest.raises(UnsupportedCamera, match=r"04\.png.*world units from the origin"):
         load_scene(folder)
 
 

@@ -230,7 +230,15 @@ def test_a_hundred_points_are_enough(write_capture: Write) -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"downscale": 0}, {"downscale": 1.5}, {"test_every": 1}, {"background": (0.0, 2.0, 0.0)}]
+    "settings",
+    [
+        {"downscale": 0},
+        {"downscale": 1.5},
+        {"downscale": 4},  # 24 x 16 pixels become 6 x 4
+        {"downscale": 1600},  # 3DGS takes it for a width
+        {"test_every": 1},
+        {"background": (0.0, 2.0, 0.0)},
+    ],
 )
 def test_settings_out_of_range_are_refused(write_capture: Write, settings: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(settings))):

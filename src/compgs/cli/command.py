@@ -32,7 +32,8 @@ class ComputingCommand(Command):
     """A command that computes for a while."""
 
     threads: Annotated[int | None, arg(metavar="N", help_behavior_hint=NO_DEFAULT)] = None
-    """Threads to use; all cores by default. What a file decodes to does not depend on it; a training may, in the last bits."""
+    """Threads to use; all cores by default. What a file decodes to does not depend on it; a training may, in its
+    last bits."""
 
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint=NO_DEFAULT)] = None
     """Where to compute; a CUDA GPU by default where there is one."""
@@ -77,7 +78,7 @@ class SceneOptions:
     background: Annotated[
         tuple[float, float, float] | None, arg(metavar="R G B", help_behavior_hint=NO_DEFAULT)
     ] = None
-    """Color behind everything, 0 to 1; by default white for Blender scenes with transparency, else black."""
+    """Color behind everything, 0 to 1; by default white for Blender scenes, else black."""
 
     def scene_source(self, *, holdout: bool = True) -> SceneSource:
         """Raises UsageError if not exactly one scene was given."""

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated
 
@@ -74,9 +75,11 @@ class DemoScene(Command):
 
 
 def check_only_a_scene(folder: Path) -> None:
-    """Raises OutputError if a folder that is to be replaced holds anything else than a scene."""
-    others = [path for path in folder.glob("*") if path.name not in ("images", "sparse")]
+    """Raises OutputError if a folder that is to be replaced holds anything else than a generated scene."""
+    parts = [path for path in folder.glob("*") if path.name in ("images", "sparse")]
+    others = [path for path in folder.glob("*") if path not in parts]
+    others += [path for path in (folder / "images").glob("*") if not fnmatch(path.name, "view_*.png")]
     if others:
         raise OutputError(
-            f"{others[0]}: not part of a scene, so {folder} is not replaced; choose another folder"
+            f"{others[0]}: not part of a generated scene, so {folder} is not replaced; choose another folder"
         )

@@ -9,7 +9,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.command import ComputingCommand
 from compgs.cli.console import duration, print_components, say, size
-from compgs.cli.run_folder import file_name
+from compgs.cli.run_folder import CHECKPOINT_NAME, file_name
 from compgs.errors import CheckpointError
 from compgs.outputs import check_output_file
 
@@ -45,6 +45,10 @@ class Encode(ComputingCommand):
             )
         path = self.output or self.folder / file_name(self.folder)
         check_output_file(path, overwrite=self.overwrite)
+        if not (self.folder / CHECKPOINT_NAME).is_file():
+            raise CheckpointError(
+                f"{self.folder}: has no {CHECKPOINT_NAME}; give the folder that `compgs train -o` wrote"
+            )
         self.prepare()
         from compgs.codec import encode
         from compgs.codec.reader import file_info

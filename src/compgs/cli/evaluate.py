@@ -18,7 +18,8 @@ from compgs.outputs import check_output_folder
 class Evaluate(ComputingCommand, SceneOptions, FileArgument):
     """Decode a .cgs file, render the held-out views of a scene from it and compare them with the photographs.
 
-    Give -r, --images and --test-every as in training: the views held out there are the ones to evaluate on.
+    Give -r, --images, --test-every and --background as in training: the views held out there are the ones to
+    evaluate on.
 
     Examples
 

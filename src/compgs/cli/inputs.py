@@ -2,22 +2,28 @@
 
 from pathlib import Path
 
-from compgs.errors import NotACompGSFile
+from compgs.errors import BitstreamError, NotACompGSFile
 
 
 def check_bitstream(path: Path) -> None:
-    """Raises NotACompGSFile if there is no file to read, before anything is loaded."""
+    """Raises BitstreamError if there is no whole .cgs file to read, before anything else is read or made."""
+    data = read_bitstream(path)
+    from compgs.codec.format import unpack
+
+    try:
+        unpack(data)
+    except BitstreamError as error:
+        raise type(error)(f"{path}: {error}") from error
+
+
+def read_bitstream(path: Path) -> bytes:
+    """The bytes of a file. Raises NotACompGSFile."""
     if path.is_dir():
         files = sorted(path.glob("*.cgs"))
         hint = f"; did you mean {files[0]}?" if files else ""
         raise NotACompGSFile(f"{path}: expected a .cgs file, found a folder{hint}")
     if not path.is_file():
         raise NotACompGSFile(f"{path}: there is no such file")
-
-
-def read_bitstream(path: Path) -> bytes:
-    """The bytes of a file. Raises NotACompGSFile."""
-    check_bitstream(path)
     try:
         return path.read_bytes()
     except OSError as error:

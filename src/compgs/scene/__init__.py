@@ -1,6 +1,7 @@
 """What was captured: `load_scene` finds the layout of a folder and reads views, poses and points."""
 
 import itertools
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from compgs.scene.views import Points, Scene, View, scene_extent
 __all__ = ["Points", "Scene", "View", "load_scene"]
 
 FALLBACK_POINTS = 20_000  # random points of a scene without sparse points
+MAX_DOWNSCALE = 32  # beyond it somebody means a width in pixels
 
 
 def load_scene(
@@ -35,8 +37,10 @@ def load_scene(
 
     Raises SceneError or one of its kinds for missing, damaged or contradicting data, else ConfigError.
     """
-    if downscale < 1 or int(downscale) != downscale:
-        raise ConfigError(f"downscale {downscale}: expected a whole number from 1")
+    if not 1 <= downscale <= MAX_DOWNSCALE or int(downscale) != downscale:
+        raise ConfigError(
+            f"downscale {downscale}: expected a whole number from 1 to {MAX_DOWNSCALE}, a factor, not a width"
+        )
     if test_every < 2:
         raise ConfigError(f"test_every {test_every}: expected at least 2, so that views are left to train on")
     if background is not None and not (len(background) == 3 and all(0 <= c <= 1 for c in background)):
@@ -79,8 +83,8 @@ def _read_layout(folder: Path, images: str) -> Capture:
         raise MissingSparseModel(
             f"{folder}: no camera poses found; expected a COLMAP sparse model (cameras.bin, images.bin and "
             f"points3D.bin in sparse/0), transforms_train.json (Blender) or transforms.json (nerfstudio). "
-            f"For photographs alone, run: colmap automatic_reconstructor --workspace_path {folder} "
-            f"--image_path {folder / images}"
+            f"For photographs alone, run: colmap automatic_reconstructor --workspace_path "
+            f"{shlex.quote(str(folder))} --image_path {shlex.quote(str(folder / images))}"
         )
     return replace(capture, images=tuple(sorted(capture.images, key=lambda posed: posed.name)))
 

@@ -10,6 +10,8 @@ from compgs.errors import UnsupportedCamera
 from compgs.scene.undistort import Distortion
 from compgs.scene.views import Points
 
+MAX_DISTANCE = 1e9  # world units from the origin: beyond it single precision leaves nothing of a scene
+
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
@@ -48,4 +50,9 @@ def check_camera(camera: Camera, place: str) -> None:
     if not np.isfinite(camera.world_to_camera).all():
         raise UnsupportedCamera(
             f"{place}: the pose is not finite; remove the image from the model or register it again"
+        )
+    if np.abs(camera.world_to_camera[:3, 3]).max() > MAX_DISTANCE:
+        raise UnsupportedCamera(
+            f"{place}: the camera is more than {MAX_DISTANCE:g} world units from the origin; remove the image "
+            f"from the model or register it again"
         )

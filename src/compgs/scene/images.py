@@ -12,13 +12,15 @@ import numpy as np
 from PIL import Image
 
 from compgs.cameras import Camera
-from compgs.errors import SceneError, UnreadableImage, UnsupportedCamera
+from compgs.errors import ConfigError, SceneError, UnreadableImage, UnsupportedCamera
 from compgs.scene.capture import PosedImage
 from compgs.scene.undistort import sample_bicubic, undistorted_camera, undistortion_map
 from compgs.scene.views import View
 
 # What Pillow raises for damaged files, besides OSError
 _DAMAGED = (OSError, ValueError, SyntaxError, EOFError, IndexError, MemoryError, Image.DecompressionBombError)
+
+MIN_SIDE = 8  # pixels: what downscaling must leave of an image
 
 Progress = Callable[[int, int], None]  # done, total
 _Result = TypeVar("_Result")
@@ -41,6 +43,13 @@ def load_views(
 ) -> list[View]:
     """The views at 1 / downscale of their images' size, in the given order. Everything is checked."""
     cameras = _checked_cameras(images)
+    for posed, camera in zip(images, cameras, strict=True):
+        width, height = downscaled_size((camera.width, camera.height), downscale)
+        if downscale > 1 and min(width, height) < MIN_SIDE:
+            raise ConfigError(
+                f"downscale {downscale}: leaves {width}x{height} pixels of {posed.path}, which has "
+                f"{camera.width}x{camera.height}; use a smaller factor"
+            )
     maps = _Maps()
 
     def load(index: int) -> View:
