@@ -50,7 +50,7 @@ def main() -> None:
     print("| entropy networks | bits of all streams | against floats | file, bytes | PSNR, dB |")
     print("|---|---|---|---|---|")
     print(f"| floats | {floats:.0f} | | | {quality(model.as_hybrid_model(stored_weights=False), scene):.3f} |")
-    for bits in (16, 14, 12, 10, 8):
+    for bits in (16, 14, 13, 12, 10, 8):
         with_bits(model, network_bits=bits, head_bits=stored.head_bits)
         total = sum(model.estimated_bits().values())
         size = len(write_content(to_content(model)))
