@@ -234,7 +234,7 @@ def test_a_hundred_points_are_enough(write_capture: Write) -> None:
     [
         {"downscale": 0},
         {"downscale": 1.5},
-        {"downscale": 4},  # 24 x 16 pixels become 6 x 4
+        {"downscale": 8},  # 24 x 16 pixels become 3 x 2
         {"downscale": 1600},  # 3DGS takes it for a width
         {"test_every": 1},
         {"background": (0.0, 2.0, 0.0)},

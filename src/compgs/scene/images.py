@@ -20,7 +20,7 @@ from compgs.scene.views import View
 # What Pillow raises for damaged files, besides OSError
 _DAMAGED = (OSError, ValueError, SyntaxError, EOFError, IndexError, MemoryError, Image.DecompressionBombError)
 
-MIN_SIDE = 8  # pixels: what downscaling must leave of an image
+MIN_SIDE = 4  # pixels: what downscaling must leave of an image
 
 Progress = Callable[[int, int], None]  # done, total
 _Result = TypeVar("_Result")
