@@ -127,13 +127,27 @@ class EntropyModel(nn.Module):
         bits: dict[str, Tensor] = {}
         if rate:
             bits = {
-                "reference_hyper": self.reference_density.bits(_relax(z_f, noise)),
+                "reference_hyper": _hyper_bits(self.reference_density, z_f, noise),
                 "reference": gaussian_bits(_relax(references - mean_f, noise), scale_f),
                 "covariance": gaussian_bits(_relax(covariances - mean_c, noise), scale_c),
-                "residual_hyper": self.residual_density.bits(_relax(z_g, noise)),
+                "residual_hyper": _hyper_bits(self.residual_density, z_g, noise),
                 "residual": _coded_bits(_relax(residuals - mean_g, noise), scale_g, mask),
             }
         return Quantized(f_hat, c_hat, g_hat, bits)
+
+
+def _hyper_bits(density: FactorizedDensity, z: Tensor, noise: Callable[[Tensor], Tensor] | None) -> Tensor:
+    """[N] bits of hyperpriors: by the learned density in training; by the symbols' own histogram, which is what the
+    file's tables hold, when the size of the file is asked for. The density is some per cent above it: it has to be as
+    smooth as the noise.
+    """
+    if noise is not None:
+        return density.bits(z + noise(z))
+    bits = torch.zeros_like(z[:, 0])
+    for symbols in z.round().to(torch.int64).unbind(1):
+        _, inverse, counts = torch.unique(symbols, return_inverse=True, return_counts=True)
+        bits -= torch.log2(counts / len(symbols))[inverse]
+    return bits
 
 
 def _coded_bits(x: Tensor, scale: Tensor, mask: Tensor | None) -> Tensor:
