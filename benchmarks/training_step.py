@@ -30,7 +30,7 @@ SIZES = ((240, 180), (480, 360), (960, 720), (1920, 1440))
 FIXED_ANCHORS, FIXED_SIZE = 20_000, (480, 360)
 STEPS = 20  # measured, after those that are not counted
 SECONDS = 20.0  # after which a size has been measured enough
-FEWEST_STEPS = 3
+FEWEST_STEPS = 2
 PROGRESS = 0.3  # of the run: the rate is in the loss, control still observes
 
 

@@ -82,6 +82,7 @@ def bin_splats(
         means2d, covariances, determinants, colors, log2_cutoff, tiles_x,
         visible, boxes, room, packed, slots, rows, first_slot, slots_used,
     )  # fmt: skip
+    del boxes  # the peak of memory comes next
 
     keys, order = np.empty(found.sum(), np.uint32), np.empty(found.sum(), np.int32)
     gather_keys(visible, depths, found, keys, order)
