@@ -47,7 +47,9 @@ class EntropyConfig:
     covariance_step: float = 0.05  # initial learned step of the anchors' log scales; 0.01 in the paper starts
     #   on the likelihood floor in short runs
     network_hidden: int = 0  # hidden width of the entropy networks; 0: one linear layer (Ref.)
-    network_bits: int = 13  # of the entropy networks' weights in the file: 0.1 % of the bits at 12, 0.006 % at 14
+    network_bits: int = (
+        13  # of the entropy networks' weights in the file: 0.1 % of the bits at 12, 0.006 % at 14
+    )
     head_bits: int = 8  # of the prediction heads' weights in the file
 
 
@@ -86,6 +88,7 @@ class TrainingConfig:
     covariance_lr: tuple[float, float] = (4e-3, 4e-5)  # Ref.
     opacity_lr: tuple[float, float] = (2e-3, 2e-5)  # Ref.
     color_lr: tuple[float, float] = (8e-3, 8e-5)  # Ref.
+    head_warm_up: float = 0.05  # of the steps in which the heads come up to their learning rates
     entropy_lr: tuple[float, float] = (5e-3, 1e-4)  # Ref. 2e-4 -> 1e-5 hardly moves in short runs
     quantized_weights: float = (
         0.8  # of the steps before the networks' weights are trained as they will be stored
@@ -159,8 +162,24 @@ def check_config(config: Config) -> None:
         ("training.rate", t.rate in ("bits", "elements"), "bits or elements"),
         ("training.rate_start", 0 <= t.rate_start <= 1, "0 to 1"),
         ("training.seed", 0 <= t.seed < 1 << 31, "0 to 2147483647"),
-        ("control.every", c.every > 0, "above 0"),
+        ("entropy.network_hidden", 0 <= e.network_hidden <= 1024, "0 to 1024"),
+        ("training.ssim_weight", 0 <= t.ssim_weight <= 1, "0 to 1"),
+        ("training.scale_weight", 0 <= t.scale_weight < 1e6, "0 or more"),
+        ("training.quantized_weights", 0 <= t.quantized_weights <= 1, "0 to 1"),
+        ("training.head_warm_up", 0 <= t.head_warm_up <= 1, "0 to 1"),
+        ("training.checkpoint_minutes", 0 < t.checkpoint_minutes < 1e6, "above 0"),
+        ("control.start", 0 <= c.start <= 1, "0 to 1"),
+        ("control.stop", 0 <= c.stop <= 1, "0 to 1"),
+        ("control.every", 0 < c.every <= 1, "above 0, up to 1"),
+        ("control.gradient_threshold", 0 < c.gradient_threshold < 1e6, "above 0"),
+        ("control.minimum_views", 0 <= c.minimum_views < 1 << 31, "0 or more"),
+        ("control.opacity_threshold", 0 <= c.opacity_threshold < 1e3, "0 or more"),
+        ("control.growth_probability", 0 <= c.growth_probability <= 1, "0 to 1"),
     ]
+    for name, rates in dataclasses.asdict(t).items():
+        if name.endswith("_lr"):
+            good = len(rates) == 2 and all(0 < rate < 100 for rate in rates)
+            rules.append((f"training.{name}", good, "two learning rates above 0, first and last"))
     for name, good, legal in rules:
         if not good:
             section, key = name.split(".")

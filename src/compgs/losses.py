@@ -27,6 +27,8 @@ from torch import Tensor
 
 from compgs.ssim import l1_and_ssim, ssim
 
+REVIVED = 0.05  # opacity, well above the rasterizer's cutoff
+
 
 @dataclass(frozen=True)
 class Target:
@@ -83,6 +85,15 @@ class _FusedPhotometric(torch.autograd.Function):
 def scale_regularizer(scales: Tensor) -> Tensor:
     """Mean product of the three scales, [M, 3] world units: large primitives are expensive to render."""
     return scales.prod(1).sum() / max(1, len(scales))  # (a view may see none)
+
+
+def revival_loss(opacities: Tensor) -> Tensor:
+    """Pulls the opacities [P] of primitives that are not drawn back to where they are.
+
+    On an empty background, all opacities fall together before the references can tell the object from the air around
+    it; below the cutoff nothing would ever bring them back.
+    """
+    return 0.1 * torch.relu(REVIVED - opacities).mean()
 
 
 def rate(bits: Mapping[str, Tensor], elements: Mapping[str, int], normalization: str) -> Tensor:

@@ -79,3 +79,17 @@ def test_a_failed_write_keeps_the_previous_checkpoint(blob_scene, tiny_config, t
         trainer.save(path)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_ctrl_c_inside_a_step_waits_for_its_end():
+    import signal
+
+    from compgs.training.interrupt import held_back
+
+    done = []
+    with pytest.raises(KeyboardInterrupt), held_back():
+        signal.raise_signal(signal.SIGINT)
+        done.append("the rest of the step")
+    assert done == ["the rest of the step"]
+    with held_back():
+        done.append("no interrupt, no exception")

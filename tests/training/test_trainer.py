@@ -5,6 +5,9 @@ import pytest
 import torch
 
 from compgs.errors import ConfigError, TrainingError
+from compgs.gaussians import Gaussians
+from compgs.metrics import psnr, to_8bit
+from compgs.render import RasterSettings, rasterize, render
 from compgs.scene.views import View
 from compgs.training import train
 from compgs.training.trainer import Trainer
@@ -65,6 +68,32 @@ def test_primitives_that_no_view_sees_are_dropped_at_the_end(blob_scene, tiny_co
     assert mask.any() and mask.shape == (trainer.model.anchors, 4)
     hybrid = trainer.model.as_hybrid_model()
     assert hybrid.coupled == int(mask.sum())
+
+
+def test_one_object_on_white_does_not_vanish(blob_scene, tiny_config):
+    """Most pixels ask for less: without care all opacities fall, or all colors turn white, and nothing comes back."""
+    g = torch.Generator().manual_seed(0)
+    ball = torch.nn.functional.normalize(torch.randn(60, 3, generator=g), dim=1) * 0.35
+    gaussians = Gaussians(
+        ball, torch.tensor([[1.0, 0, 0, 0]]).repeat(60, 1), torch.full((60, 3), 0.1), torch.full((60,), 0.95),
+        torch.tensor([0.1, 0.3, 0.8]).repeat(60, 1),
+    )  # fmt: skip
+    white = RasterSettings(background=(1.0, 1.0, 1.0))
+    views = tuple(
+        replace(
+            v, image=(rasterize(gaussians, v.camera, white).image.clamp(0, 1) * 255).to(torch.uint8).numpy()
+        )
+        for v in blob_scene.train_views
+    )
+    scene = replace(blob_scene, train_views=views, background=(1.0, 1.0, 1.0))
+    config = replace(tiny_config, training=replace(tiny_config.training, steps=200))
+    trainer = Trainer(scene, config, CPU)
+    trainer.run(None, None)
+    model = trainer.model.as_hybrid_model()
+    for view in views[:3]:
+        assert psnr(to_8bit(render(model, view.camera).image), view.image) > 3 + psnr(
+            np.full_like(view.image, 255), view.image
+        )
 
 
 def away(view: View) -> View:

@@ -12,7 +12,7 @@ import torch
 from compgs.codec.content import STREAMS, FileContent, Latents
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.codec.reader import read_latents
-from compgs.errors import BitstreamError, CorruptSection
+from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.prediction import PredictionHeads
 from compgs.model.primitives import Primitives
@@ -21,10 +21,13 @@ from compgs.model.primitives import Primitives
 def decode(path: str | Path, device: str | torch.device | None = None) -> HybridModel:
     """The scene in a .cgs file, on the CPU unless a device is given.
 
-    Raises a BitstreamError that names the file and the section if it cannot be decoded, OSError if it cannot be read.
+    Raises a BitstreamError that names the file and the section if it cannot be decoded, or read at all.
     """
     path = Path(path)
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise NotACompGSFile(f"{path}: cannot be read ({error.strerror})") from error
     try:
         content, latents = read_latents(data)
         # The symbols have served; with them the peak would be above three times the size of the model.

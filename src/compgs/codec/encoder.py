@@ -46,6 +46,11 @@ def encode(
     Raises NotEncodable for a model that the format cannot represent, OutputError if the file exists (unless
     `overwrite`) or cannot be written.
     """
+    if not isinstance(model, TrainedModel):
+        raise NotEncodable(
+            f"expected a trained model, as compgs.train and load_run give it, found {type(model).__name__}; "
+            "a decoded file is a .cgs file already: copy it"
+        )
     path = Path(path)
     check_output_file(path, overwrite=overwrite)
     content = to_content(model)

@@ -75,8 +75,8 @@ def weight_exponent(weight: Tensor, bits: int) -> int:
     """Largest e in 0..24 for which round(weight * 2^e) fits into `bits` signed bits."""
     largest = float(weight.detach().abs().max()) if weight.numel() else 0.0
     limit = (1 << (bits - 1)) - 1
-    if largest <= 0.0:
-        return 0
+    if not 0.0 < largest < math.inf:
+        return 0  # (the loss says so if a training has diverged)
     exponent = math.floor(math.log2(limit / largest))
     while exponent > 0 and round(largest * 2.0**exponent) > limit:
         exponent -= 1

@@ -21,7 +21,7 @@ _ONE = np.float32(1)
 
 class SelectVisible(torch.autograd.Function):
     """raw [P, 4], residuals [P, G] -> of the primitives that are drawn: opacities [M], colors [M, 3], residuals [M, G];
-    without gradient: their index [M], and opacities [P] of all.
+    their index [M] (no gradient), and opacities [P] of all.
     """
 
     @staticmethod
@@ -41,25 +41,34 @@ class SelectVisible(torch.autograd.Function):
             colors.numpy(),
             chosen.numpy(),
         )
-        ctx.save_for_backward(index, opacities, colors)
+        ctx.save_for_backward(index, opacities, colors, all_opacities)
         ctx.shapes = raw.shape, residuals.shape
-        ctx.mark_non_differentiable(index, all_opacities)
+        ctx.mark_non_differentiable(index)
+        ctx.set_materialize_grads(False)
         return opacities, colors, chosen, index, all_opacities
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        index, opacities, colors = ctx.saved_tensors
+        index, opacities, colors, all_opacities = ctx.saved_tensors
         d_raw, d_residuals = (opacities.new_zeros(shape) for shape in ctx.shapes)
+        d_opacities, d_colors, d_chosen = (
+            shape_of.new_zeros(shape_of.shape) if g is None else g.contiguous()
+            for g, shape_of in zip(
+                grads, (opacities, colors, opacities.new_empty(len(index), ctx.shapes[1][1])), strict=False
+            )
+        )
         _select_gradient(
             index.numpy(),
-            opacities.numpy(),
-            colors.numpy(),
-            grads[0].contiguous().numpy(),
-            grads[1].contiguous().numpy(),
-            grads[2].contiguous().numpy(),
+            opacities.detach().numpy(),
+            colors.detach().numpy(),
+            d_opacities.numpy(),
+            d_colors.numpy(),
+            d_chosen.numpy(),
             d_raw.numpy(),
             d_residuals.numpy(),
         )
+        if grads[4] is not None:
+            d_raw[:, 0] += grads[4] * (1.0 - all_opacities.detach() ** 2)
         return d_raw, d_residuals, None
 
 

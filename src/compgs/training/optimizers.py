@@ -10,6 +10,7 @@ from compgs.config import TrainingConfig
 from compgs.trained_model import TrainedModel
 
 ANCHOR_PARAMETERS = ("log_scales", "references", "residuals")
+HEAD_GROUPS = ("geometry", "appearance", "translation", "covariance", "opacity", "color")
 ADAM_EPSILON = 1e-15  # gradients of single primitives are tiny (3DGS)
 
 
@@ -37,11 +38,19 @@ def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.A
     return torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
 
 
-def set_learning_rates(optimizer: torch.optim.Optimizer, progress: float) -> None:
-    """Log-linear from the first to the last rate of each group; `progress` in 0..1."""
+def set_learning_rates(optimizer: torch.optim.Optimizer, progress: float, warm_up: float = 0.0) -> None:
+    """Log-linear from the first to the last rate of each group; `progress` in 0..1.
+
+    In the first `warm_up` of the run the prediction heads come up to their rates from a hundredth of them: at full rate
+    they would make the whole scene transparent or white, where nothing has a gradient, before the embeddings can tell
+    one place from another.
+    """
+    rising = min(1.0, 0.01 + progress / warm_up) if warm_up > 0 else 1.0
     for group in optimizer.param_groups:
         first, last = group["rates"]
         group["lr"] = first * math.exp(progress * math.log(last / first))
+        if group["name"] in HEAD_GROUPS:
+            group["lr"] *= rising
 
 
 @torch.no_grad()

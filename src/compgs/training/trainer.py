@@ -15,7 +15,14 @@ from compgs.config import Config, check_config, load_config
 from compgs.entropy import Quantized
 from compgs.entropy.quantization import UniformNoise
 from compgs.errors import CheckpointError, ConfigError, TrainingError
-from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer
+from compgs.losses import (
+    Target,
+    photometric_loss,
+    rate,
+    rate_distortion_loss,
+    revival_loss,
+    scale_regularizer,
+)
 from compgs.model.prediction import OPACITY_CUTOFF, Prediction, predict
 from compgs.render import RasterSettings, rasterize, visible_mask
 from compgs.scene.points import median_spacing, voxel_grid
@@ -30,9 +37,12 @@ from compgs.training.checkpoint import (
     save_checkpoint,
 )
 from compgs.training.control import AdaptiveControl, make_schedule
+from compgs.training.interrupt import held_back
 from compgs.training.optimizers import make_optimizer, set_learning_rates
 from compgs.training.profile import NoProfile, StepProfile
 
+# With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
+FEW_DRAWN = 0.1
 REPORT_EVERY = 10  # steps between two status reports
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it looks at every anchor
 POSITION_BITS = 10.0  # bits per anchor position, for the estimate only
@@ -145,6 +155,8 @@ class Trainer:
             rendered.means2d.retain_grad()
         distortion = photometric_loss(rendered.image, self.target(view_index), t.ssim_weight)
         loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales)
+        if len(prediction.index) < FEW_DRAWN * len(prediction.opacities):
+            loss = loss + revival_loss(prediction.opacities)
         profile.lap("loss")
         if latents.bits:
             elements = self.elements(len(rows))
@@ -161,7 +173,7 @@ class Trainer:
         loss.backward()
         profile.lap("entropy, backward")
 
-        set_learning_rates(self.optimizer, progress)
+        set_learning_rates(self.optimizer, progress, t.head_warm_up)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         profile.lap("optimizer")
@@ -247,7 +259,8 @@ class Trainer:
         estimate, pace, counted = 0, 0.0, self.step
         try:
             while self.step < t.steps:
-                result = self.train_step()
+                with held_back():
+                    result = self.train_step()
                 now = time.perf_counter()
                 if on_progress and (self.step % REPORT_EVERY == 0 or self.step == t.steps):
                     if self.step % ESTIMATE_EVERY == 0 or not estimate:
