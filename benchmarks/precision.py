@@ -35,7 +35,9 @@ def with_bits(model: TrainedModel, **bits: int) -> TrainedModel:
 
 @torch.no_grad()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("run")
     parser.add_argument("scene")
     parser.add_argument("-r", type=int, default=1)
@@ -49,14 +51,18 @@ def main() -> None:
     floats = sum(float(b.sum(dtype=torch.float64)) for b in exact.values())
     print("| entropy networks | bits of all streams | against floats | file, bytes | PSNR, dB |")
     print("|---|---|---|---|---|")
-    print(f"| floats | {floats:.0f} | | | {quality(model.as_hybrid_model(stored_weights=False), scene):.3f} |")
+    print(
+        f"| floats | {floats:.0f} | | | {quality(model.as_hybrid_model(stored_weights=False), scene):.3f} |"
+    )
     for bits in (16, 14, 13, 12, 10, 8):
         with_bits(model, network_bits=bits, head_bits=stored.head_bits)
         total = sum(model.estimated_bits().values())
         size = len(write_content(to_content(model)))
         found = quality(model.as_hybrid_model(), scene)
         mark = " (trained with)" if bits == stored.network_bits else ""
-        print(f"| {bits} bits{mark} | {total:.0f} | {100 * (total / floats - 1):+.3f} % | {size} | {found:.3f} |")
+        print(
+            f"| {bits} bits{mark} | {total:.0f} | {100 * (total / floats - 1):+.3f} % | {size} | {found:.3f} |"
+        )
     print("\n| prediction heads | file, bytes | PSNR, dB |\n|---|---|---|")
     for bits in (16, 12, 10, 8, 7, 6):
         with_bits(model, network_bits=stored.network_bits, head_bits=bits)
