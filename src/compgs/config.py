@@ -75,6 +75,7 @@ class TrainingConfig:
     steps: int = 30_000  # one view each
     seed: int = 0
     lmbda: float = 0.001  # weight of the rate
+    target_bytes: int | None = None  # size of the file to aim at: lambda, from its setting on, follows it
     rate: Literal["bits", "elements"] = (
         "bits"  # bits: true bits, normalized so that lambda means the same as in
     )
@@ -159,6 +160,7 @@ def check_config(config: Config) -> None:
         ("entropy.head_bits", 6 <= e.head_bits <= 16, "6 to 16"),
         ("training.steps", 1 <= t.steps <= 10_000_000, "1 to 10000000"),
         ("training.lmbda", 0 <= t.lmbda <= 100, "0 to 100"),
+        ("training.target_bytes", t.target_bytes is None or 0 < t.target_bytes < 1 << 40, "above 0"),
         ("training.rate", t.rate in ("bits", "elements"), "bits or elements"),
         ("training.rate_start", 0 <= t.rate_start <= 1, "0 to 1"),
         ("training.seed", 0 <= t.seed < 1 << 31, "0 to 2147483647"),

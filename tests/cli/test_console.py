@@ -39,12 +39,12 @@ class Status:
     anchors: int = 4211
     estimated_bytes: int = 181_000
     seconds_per_step: float = 0.08
+    lmbda: float = 0.001
 
 
 def test_a_status_says_rate_loss_quality_anchors_size_and_time_left() -> None:
-    assert (
-        progress.describe(Status(10)) == "12.5 steps/s  loss 0.0500  PSNR 27.9 dB  4,211 anchors  ~181.0 kB"
-    )  # type: ignore[arg-type]
+    text = progress.describe(Status(10))  # type: ignore[arg-type]
+    assert text == "12.5 steps/s  loss 0.0500  PSNR 27.9 dB  4,211 anchors  ~181.0 kB  lambda 0.001"
     assert progress.time_left(Status(10)) == "7 s left"  # type: ignore[arg-type]
 
 

@@ -66,11 +66,11 @@ def training() -> Iterator[Callable[["TrainingStatus"], None]]:
 
 
 def describe(status: "TrainingStatus") -> str:
-    """`12.3 steps/s  loss 0.0512  PSNR 27.9 dB  4,211 anchors  ~181.0 kB`."""
+    """`12.3 steps/s  loss 0.0512  PSNR 27.9 dB  4,211 anchors  ~181.0 kB  lambda 0.001`."""
     rate = 1 / status.seconds_per_step if status.seconds_per_step > 0 else 0.0
     return (
         f"{rate:.1f} steps/s  loss {status.loss:.4f}  PSNR {status.psnr:.1f} dB  {status.anchors:,} anchors  "
-        f"~{size(status.estimated_bytes)}"
+        f"~{size(status.estimated_bytes)}  lambda {status.lmbda:.2g}"
     )
 
 

@@ -1,5 +1,6 @@
 """`compgs train`: photographs in, one small file out, and proof of what the file is worth."""
 
+import json
 import shlex
 import time
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from compgs.cli.run_folder import (
 )
 from compgs.cli.scenes import read_scene
 from compgs.cli.settings import with_settings
+from compgs.cli.sizes import parse_size
 from compgs.config import load_config
 from compgs.errors import CheckpointError, ConfigError, OutputError
 from compgs.outputs import check_output_folder, write_json
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 NEEDED_BYTES = (
     64 << 20
 )  # checkpoint, file and renders of a small scene; a large one fails later, but loses nothing
+NOTABLE_MISS = 0.05  # of the size that was asked for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +55,8 @@ class Train(ComputingCommand, SceneOptions):
 
     compgs train scenes/garden -o runs/small --lmbda 0.01 --set model.coupled_primitives=5
 
+    compgs train scenes/garden -o runs/two --target-size 2MB
+
     compgs train -o runs/garden --resume
     """
 
@@ -69,6 +74,10 @@ class Train(ComputingCommand, SceneOptions):
 
     lmbda: Annotated[float | None, arg(metavar="LAMBDA", help_behavior_hint="(default: the preset's)")] = None
     """Weight of the rate: larger means a smaller file."""
+
+    target_size: Annotated[str | None, arg(metavar="SIZE", help_behavior_hint=NO_DEFAULT)] = None
+    """Size of the file: 130kB, 2MB, 1.5MiB or plain bytes. The weight of the rate is then found while training, and
+    --lmbda is where it begins."""
 
     steps: Annotated[
         int | None, arg(aliases=["--iterations"], metavar="N", help_behavior_hint="(default: the preset's)")
@@ -110,6 +119,8 @@ class Train(ComputingCommand, SceneOptions):
             save_settings(folder, settings)
         model = self.train(scene, settings, folder)
         self.encode_and_evaluate(scene, model, folder)
+        if settings.config.training.target_bytes is not None:
+            say_miss(folder, settings.config.training.target_bytes)
 
     def settings(self, folder: Path) -> RunSettings:
         """From the command line, or of the run to be continued. Raises ConfigError, CheckpointError."""
@@ -136,7 +147,12 @@ class Train(ComputingCommand, SceneOptions):
 
     def assignments(self) -> tuple[str, ...]:
         """Options that are settings, as `section.key=value`."""
-        named = {"training.lmbda": self.lmbda, "training.steps": self.steps, "training.seed": self.seed}
+        named = {
+            "training.lmbda": self.lmbda,
+            "training.target_bytes": self.target_size and parse_size(self.target_size, "--target-size"),
+            "training.steps": self.steps,
+            "training.seed": self.seed,
+        }
         return (*(f"{name}={value}" for name, value in named.items() if value is not None), *self.set)
 
     def train(self, scene: "Scene", settings: RunSettings, folder: Path) -> "TrainedModel":
@@ -173,6 +189,7 @@ class Train(ComputingCommand, SceneOptions):
                     "steps": last.steps,
                     "anchors": last.anchors,
                     "estimated_bytes": last.estimated_bytes,
+                    "lmbda": last.lmbda,
                     "seconds": seconds,
                     "seconds_per_step": last.seconds_per_step,
                     "resumed": self.resume,
@@ -210,6 +227,23 @@ class Train(ComputingCommand, SceneOptions):
         say("")
         say(f"renders beside photographs: {folder / 'contact_sheet.png'}")
         say(f"for programs: {folder / 'results.json'}, {folder / 'per_view.json'}")
+
+
+def say_miss(folder: Path, target: int) -> None:
+    """How far from the size that was asked for the file is; training.json gets it too."""
+    written = (folder / file_name(folder)).stat().st_size
+    miss = written / target - 1
+    say(f"asked {size(target)}, written {size(written)}: {100 * miss:+.1f} %")
+    path = folder / TRAINING_NAME
+    facts = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    write_json(path, {**facts, "target_bytes": target, "bytes": written, "miss": miss})
+    if abs(miss) > NOTABLE_MISS:
+        lmbda = f"lambda ended at {facts['lmbda']:.3g}, within 1e-05 to 1" if "lmbda" in facts else "lambda"
+        way = "fewer anchors (model.voxel_spacings)" if miss > 0 else "more anchors (model.voxel_spacings)"
+        say(
+            f"note: {size(written)} is what these settings reached ({lmbda}); more --steps let it settle, "
+            f"{way} or another --preset move the range"
+        )
 
 
 def forget_earlier_run(folder: Path) -> None:

@@ -1,8 +1,9 @@
 """Rate-distortion optimization of one scene (CompGS Sec. 3.4): a loop short enough to read aloud."""
 
+import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from torch import Tensor
 from compgs.cameras import Camera
 from compgs.config import Config, check_config, load_config
 from compgs.entropy import Quantized
-from compgs.entropy.quantization import UniformNoise
+from compgs.entropy.network import FRACTION_BITS
+from compgs.entropy.quantization import UniformNoise, weight_exponent
 from compgs.errors import CheckpointError, ConfigError, TrainingError
 from compgs.losses import (
     Target,
@@ -27,7 +29,7 @@ from compgs.model.prediction import OPACITY_CUTOFF, Prediction, predict
 from compgs.render import RasterSettings, rasterize, visible_mask
 from compgs.scene.points import median_spacing, voxel_grid
 from compgs.scene.views import Scene, View
-from compgs.trained_model import TrainedModel
+from compgs.trained_model import BIAS_BITS, TrainedModel
 from compgs.training.checkpoint import (
     CHECKPOINT_NAME,
     Checkpoint,
@@ -40,13 +42,15 @@ from compgs.training.control import AdaptiveControl, make_schedule
 from compgs.training.interrupt import held_back
 from compgs.training.optimizers import make_optimizer, set_learning_rates
 from compgs.training.profile import NoProfile, StepProfile
+from compgs.training.rate_control import RateState, due, follow
 
 # With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
 FEW_DRAWN = 0.1
 REPORT_EVERY = 10  # steps between two status reports
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it looks at every anchor
 POSITION_BITS = 10.0  # bits per anchor position, for the estimate only
-CODED_WEIGHT_BITS = -1.0  # bits that entropy coding takes off a stored weight, for the estimate only
+OTHER_BYTES = 400  # scene, tables, metadata, container, for the estimate only
+SHARES = 10  # looks in a run at how much the last step drops, where the size is controlled
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,7 @@ class TrainingStatus:
     anchors: int
     estimated_bytes: int
     seconds_per_step: float
+    lmbda: float  # weight of the rate; follows the size where one is asked for
 
 
 @dataclass(frozen=True)
@@ -125,7 +130,14 @@ class Trainer:
         self.targets: dict[int, Target] = {}
         self.settings = RasterSettings(background=scene.background)
         self.step = 0
+        self.rate = RateState(config.training.lmbda)
         self.profile: StepProfile = NoProfile()
+        target, least = config.training.target_bytes, self.fixed_bytes()
+        if target is not None and target <= least:
+            raise ConfigError(
+                f"training.target_bytes = {target}: the networks alone take about {least} bytes; "
+                "ask for more, or make them smaller (model.width, model.coupled_primitives)"
+            )
 
     # one step ------------------------------------------------------------------------------------------------------
 
@@ -160,7 +172,7 @@ class Trainer:
         profile.lap("loss")
         if latents.bits:
             elements = self.elements(len(rows))
-            loss = rate_distortion_loss(loss, rate(latents.bits, elements, t.rate), t.lmbda)
+            loss = rate_distortion_loss(loss, rate(latents.bits, elements, t.rate), self.rate.lmbda)
         profile.lap("entropy")
         profile.lap_on_gradient("loss, backward", rendered.image)
         profile.lap_on_gradient("rasterization, backward", rendered.means2d)
@@ -186,11 +198,13 @@ class Trainer:
             profile.lap("control")
         profile.end()
         self.step += 1
+        self.control_rate()
         return StepResult(float(loss.detach()), rendered.image.detach(), view)
 
     def skip(self, view: View) -> StepResult:
         """A step on a view that no anchor is in: nothing can be learned from it."""
         self.step += 1
+        self.control_rate()
         background = torch.tensor(self.scene.background, device=self.device)
         return StepResult(0.0, background.expand(*view.image.shape), view)
 
@@ -290,21 +304,61 @@ class Trainer:
         error = float(((result.image.clamp(0, 1) - photograph) ** 2).mean())
         psnr = -10.0 * float(np.log10(max(error, 1e-10)))
         return TrainingStatus(
-            self.step, self.config.training.steps, result.loss, psnr, self.model.anchors, estimate, pace
-        )
+            self.step, self.config.training.steps, result.loss, psnr, self.model.anchors, estimate, pace,
+            self.rate.lmbda,
+        )  # fmt: skip
 
     def estimated_bytes(self) -> int:
         """Of the file, were it written now."""
-        e, model = self.config.entropy, self.model
-        bits = sum(model.estimated_bits().values()) + POSITION_BITS * model.anchors
-        bits += (e.head_bits + CODED_WEIGHT_BITS) * sum(p.numel() for p in model.heads.parameters())
-        for network in model.entropy.coded_networks:
-            bits += (e.network_bits + CODED_WEIGHT_BITS) * sum(p.numel() for p in network.parameters())
-        return int(bits / 8)
+        model = self.model
+        anchors = int(model.mask.any(1).sum())
+        bits = sum(model.estimated_bits().values()) + POSITION_BITS * anchors
+        return int(bits / 8) + self.fixed_bytes()
 
     @torch.no_grad()
+    def fixed_bytes(self) -> int:
+        """Of the networks and all that does not grow with the scene, about: no lambda makes it smaller."""
+        e, model = self.config.entropy, self.model
+        bits = sum(
+            coded_weight_bits(p, e.head_bits if p.dim() > 1 else BIAS_BITS) for p in model.heads.parameters()
+        )
+        for network in model.entropy.coded_networks:
+            for weight, bias in network.layers():
+                bits += coded_weight_bits(weight, e.network_bits)
+                bits += gaussian_entropy(bias * 2.0**FRACTION_BITS)
+        return int(bits / 8) + OTHER_BYTES
+
+    def control_rate(self) -> None:
+        """Where a size is asked for, look now and then at what the file would take, and follow it with lambda."""
+        t = self.config.training
+        if t.target_bytes is None or not due(self.step, t.steps, t.rate_start):
+            return
+        grown = not self.schedule.active(self.step)
+        fixed = self.fixed_bytes()
+        size = self.estimated_bytes() - fixed
+        if grown and (self.rate.error is None or self.step % max(1, t.steps // SHARES) == 0):
+            self.rate = replace(self.rate, share=self.seen_share())
+        target = max(1, t.target_bytes - fixed)
+        progress = self.step / t.steps
+        self.rate = follow(self.rate, size * self.rate.share, target, progress=progress, grown=grown)
+
+    def seen_share(self) -> float:
+        """Of the bytes that are not fixed: those that stay when what no view sees is dropped at the end."""
+        mask, fixed, size = self.model.mask, self.fixed_bytes(), self.estimated_bytes()
+        self.model.mask = self.seen()
+        share = (self.estimated_bytes() - fixed) / (size - fixed) if self.model.mask.any() else 1.0
+        self.model.mask = mask
+        return share
+
     def finish(self) -> None:
         """Drop coupled primitives that no training view ever sees, and anchors that have none left."""
+        self.model.mask = self.seen()
+        if not self.model.mask.any():
+            raise TrainingError("no primitive is visible in any training view; the run has failed")
+
+    @torch.no_grad()
+    def seen(self) -> Tensor:
+        """[N, K] bool: coupled primitives that some training view sees."""
         model, k = self.model, self.config.model.coupled_primitives
         opacity = torch.zeros(model.anchors, k, device=self.device)
         for view in self.scene.train_views:
@@ -312,9 +366,7 @@ class Trainer:
             latents = model.quantized(rows)
             seen = self.predict(latents, rows, view.camera, stored=True).opacities.view(-1, k)
             opacity[rows] = torch.maximum(opacity[rows], seen)
-        model.mask = opacity > OPACITY_CUTOFF
-        if not model.mask.any():
-            raise TrainingError("no primitive is visible in any training view; the run has failed")
+        return opacity > OPACITY_CUTOFF
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
@@ -326,6 +378,7 @@ class Trainer:
             "order": self.order,
             "shuffle": self.shuffle.bit_generator.state,
             "views": [view.name for view in self.scene.train_views],
+            "rate": asdict(self.rate),
         }
         save_checkpoint(
             path, Checkpoint(self.model, optimizer_tensors(self.model, self.optimizer), extra, state)
@@ -353,7 +406,19 @@ class Trainer:
         trainer.shuffle.bit_generator.state = checkpoint.state["shuffle"]
         trainer.order = checkpoint.state["order"]
         trainer.step = checkpoint.state["step"]
+        trainer.rate = RateState(**checkpoint.state["rate"])
         return trainer
+
+
+def coded_weight_bits(weight: Tensor, bits: int) -> float:
+    """Of a network's weights in the file, where they are integers of so many bits."""
+    return gaussian_entropy(weight * 2.0 ** weight_exponent(weight, bits))
+
+
+def gaussian_entropy(values: Tensor) -> float:
+    """Bits of values that are rounded to integers and coded as if from one Gaussian of their spread."""
+    variance = float(values.detach().double().var(correction=0)) + 1 / 12  # of the rounding
+    return values.numel() * max(0.0, 0.5 * math.log2(2 * math.pi * math.e * variance))
 
 
 def initial_model(scene: Scene, config: Config) -> TrainedModel:

@@ -1,0 +1,21 @@
+"""Sizes of files as people type them."""
+
+import re
+
+from compgs.cli.command import UsageError
+
+UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30}
+
+
+def parse_size(text: str, option: str) -> int:
+    """Bytes of `130kB`, `2 MB`, `1.5MiB` or `130000`; a kB is 1000 bytes. Raises UsageError that names the option."""
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]*)\s*", text)
+    if match is None or match[2].lower() not in UNITS:
+        raise UsageError(
+            f"{option} {text}: expected a size such as 130kB, 2MB, 1.5MiB or plain bytes; "
+            "units are B, kB, MB, GB (powers of 1000) and KiB, MiB, GiB"
+        )
+    count = round(float(match[1]) * UNITS[match[2].lower()])
+    if count < 1:
+        raise UsageError(f"{option} {text}: expected at least one byte")
+    return count

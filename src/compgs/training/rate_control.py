@@ -1,0 +1,58 @@
+"""A file of a given size from one training: lambda follows the size that the file would have now.
+
+    e = log((size - fixed) / (target - fixed));    log lambda += integral * e + proportional * (e - e before)
+
+where `fixed` is what no lambda changes: the networks' weights. The rest answers slowly, as the embeddings have to move,
+and weakly: it goes with lambda^-g, g being 0.1 to 0.3 once all has settled. The gains are chosen for that: a tenth of
+the run until the size is right, without overshoot for any such g. While anchors still grow, today's size says little
+about the last one, and lambda follows gently. Towards the end the embeddings hardly move any more, and a lambda that
+went on integrating would run away for nothing.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+LOWEST, HIGHEST = 1e-5, 1.0  # of lambda
+LOOKS = 100  # at the size in a run: a look costs about as much as a training step
+FIRST_LOOK = (
+    0.1  # of the run after the rate has joined the loss: the entropy networks begin by knowing nothing
+)
+GROWING = 0.2  # integral gain of a look while anchors grow
+SETTLING = (2.0, 10.0)  # integral and proportional gain after growth
+SLOW_FROM = 0.85  # of the run: from here on the integral gain falls to zero at the end
+LARGEST_STEP = math.log(1.6)  # of log lambda in one look
+
+
+@dataclass(frozen=True)
+class RateState:
+    """What the control remembers between two looks."""
+
+    lmbda: float
+    error: float | None = None  # log(size / target) at the last look after growth; None before the first
+    share: float = 1.0  # of today's bytes that stay when what no view sees is dropped at the end
+
+
+def due(step: int, steps: int, rate_start: float) -> bool:
+    """The size is looked at after this step; `rate_start`: of the run before the rate joins the loss."""
+    return step % max(1, steps // LOOKS) == 0 and step >= (rate_start + FIRST_LOOK) * steps
+
+
+def follow(state: RateState, size: float, target: float, *, progress: float, grown: bool) -> RateState:
+    """The state after a look: `size` and `target` in bytes without what is fixed, both above 0; `progress` 0 to 1 of
+    the run; `grown` once no anchors are added any more.
+    """
+    error = math.log(size / target)
+    if not grown:
+        return replace(state, lmbda=_moved(state.lmbda, GROWING * error))
+    integral, proportional = SETTLING
+    if progress > SLOW_FROM:
+        integral *= (1.0 - progress) / (1.0 - SLOW_FROM)
+    change = integral * error
+    if state.error is not None:
+        change += proportional * (error - state.error)
+    return replace(state, lmbda=_moved(state.lmbda, change), error=error)
+
+
+def _moved(lmbda: float, change: float) -> float:
+    change = min(max(change, -LARGEST_STEP), LARGEST_STEP)
+    return min(max(lmbda * math.exp(change), LOWEST), HIGHEST)

@@ -1,0 +1,85 @@
+"""A size asked for: the controller against made-up scenes, and real files of a tiny scene."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from compgs.codec import encode
+from compgs.errors import ConfigError
+from compgs.training.checkpoint import load_checkpoint
+from compgs.training.rate_control import HIGHEST, LOWEST, RateState, due, follow
+from compgs.training.trainer import Trainer
+
+CPU = torch.device("cpu")
+STEPS = 1000
+
+
+def made_up_run(target: float, g: float, settling: float, lmbda: float = 0.001) -> tuple[float, float]:
+    """(size, lambda) after a run whose size moves towards 100 kB (lambda / 0.001)^-g, the faster the shorter
+    `settling` (of the run) is; half of it comes by growth, and later steps move it less.
+    """
+    state, log_size = RateState(lmbda), math.log(200e3)
+    for step in range(1, STEPS + 1):
+        progress = step / STEPS
+        here = 100e3 * min(1.0, 0.5 + progress) * (state.lmbda / 0.001) ** -g
+        log_size += (math.log(here) - log_size) / (settling * STEPS) * math.exp(-2 * progress)
+        if due(step, STEPS, 0.1):
+            state = follow(state, math.exp(log_size), target, progress=progress, grown=progress >= 0.5)
+    return math.exp(log_size), state.lmbda
+
+
+@pytest.mark.parametrize("g", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("settling", [0.02, 0.05])
+@pytest.mark.parametrize("target", [70e3, 100e3, 130e3])
+def test_the_size_is_reached_however_strongly_it_answers_to_lambda(
+    target: float, settling: float, g: float
+) -> None:
+    assert made_up_run(target, g, settling)[0] == pytest.approx(target, rel=0.03)
+
+
+@pytest.mark.parametrize(("target", "limit"), [(1e3, HIGHEST), (1e7, LOWEST)])
+def test_out_of_reach_lambda_stays_at_its_limit(target: float, limit: float) -> None:
+    assert made_up_run(target, 0.2, 0.02)[1] == pytest.approx(limit, rel=0.01)
+
+
+@pytest.fixture
+def longer(tiny_config):
+    return replace(
+        tiny_config,
+        control=replace(tiny_config.control, stop=0.5),
+        training=replace(tiny_config.training, steps=300),
+    )
+
+
+@pytest.mark.parametrize("target", [5900, 6700])
+def test_one_training_gives_a_file_of_the_size_that_was_asked_for(blob_scene, longer, tmp_path, target):
+    config = replace(longer, training=replace(longer.training, target_bytes=target))
+    trainer = Trainer(blob_scene, config, CPU)
+    trainer.run(None, None)
+    assert encode(trainer.model, tmp_path / "a.cgs").bytes == pytest.approx(target, rel=0.05)
+
+
+def test_a_run_that_seeks_a_size_continues_exactly_and_needs_no_display(blob_scene, tiny_config, tmp_path):
+    config = replace(tiny_config, training=replace(tiny_config.training, target_bytes=6000))
+    whole = Trainer(blob_scene, config, CPU)
+    whole.run(None, lambda status: None)
+    for stop in (15, 31):
+        first = Trainer(blob_scene, config, CPU)
+        for _ in range(stop):
+            first.train_step()
+        first.save(tmp_path / "checkpoint.safetensors")
+        second = Trainer.resumed(
+            blob_scene, load_checkpoint(tmp_path / "checkpoint.safetensors"), config, CPU
+        )
+        second.run(None, None)
+        assert second.rate == whole.rate != RateState(config.training.lmbda)
+        for name, value in second.model.state_dict().items():
+            assert torch.equal(value, whole.model.state_dict()[name]), name
+
+
+def test_a_size_below_that_of_the_networks_is_refused_before_any_step(blob_scene, tiny_config):
+    config = replace(tiny_config, training=replace(tiny_config.training, target_bytes=2000))
+    with pytest.raises(ConfigError, match=r"target_bytes = 2000: the networks alone"):
+        Trainer(blob_scene, config, CPU)
