@@ -63,6 +63,7 @@ def test_the_installed_command_and_the_module_are_the_same() -> None:
         ["train", "-o", "run"],
         ["train", "scene", "-s", "other", "-o", "run"],
         ["train", "scene", "-o", "run", "--resume", "--overwrite"],
+        ["train", "scene", "-o", "run", "--target-size", "small"],
         ["demo-scene", "scene", "--views", "1"],
         ["demo-scene", "scene", "--width", "4"],
     ],
@@ -95,6 +96,10 @@ def test_usage_errors_exit_with_2(
         (["encode", "nowhere"], "nowhere"),
         (["encode", "full", "-o", "file"], "overwrite"),
         (["encode", "empty", "-o", "out.cgs"], "checkpoint.safetensors"),
+        (["encode", "nowhere.cgs", "--drop", "2", "-o", "out.cgs"], "drop = 2"),
+        (["encode", "GOLDEN", "--coarser", "0.5", "-o", "out.cgs"], "coarser = 0.5"),
+        (["encode", "GOLDEN", "--drop", "0.5", "-o", "file"], "overwrite"),
+        (["encode", "file", "--drop", "0.5", "-o", "out.cgs"], "file: header"),
         (["decode", "nowhere.cgs"], "nowhere.cgs"),
         (["decode", "empty"], "folder"),
         (["decode", "file", "-o", "out"], "file: header"),
@@ -153,6 +158,17 @@ def test_a_damaged_file_is_refused_before_the_scene_is_read(
         assert code == 1
         assert "a.cgs: metadata: its checksum does not match" in err
         assert not (tmp_path / "out").exists()
+
+
+def test_a_file_is_encoded_again_only_to_become_a_smaller_one(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "a.cgs").write_bytes(GOLDEN_FILE.read_bytes())
+    code, _, err = outcome(capsys, "encode", tmp_path / "a.cgs", "-o", tmp_path / "b.cgs")
+    assert code == 2 and "--drop" in err
+    code, _, err = outcome(capsys, "encode", tmp_path / "a.cgs", "--drop", "0.5")
+    assert code == 2 and "-o" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["a.cgs"]
 
 
 def test_debug_shows_where_an_error_came_from(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from compgs.cli.main import parse
 from compgs.cli.run_folder import RunSettings, SceneSource, file_name, load_settings, save_settings
 from compgs.cli.settings import parse_value, with_settings
-from compgs.cli.train import CHECKPOINT_NAME, Train, forget_earlier_run, interrupted
+from compgs.cli.train import CHECKPOINT_NAME, Train, forget_earlier_run, interrupted, say_miss
 from compgs.config import Config, load_config
 from compgs.errors import CheckpointError, ConfigError
 
@@ -151,3 +151,32 @@ def test_someone_who_stops_a_run_is_told_how_to_go_on(tmp_path: Path) -> None:
     assert "before the first checkpoint" in interrupted(tmp_path)
     (tmp_path / CHECKPOINT_NAME).touch()
     assert f"compgs train -o {tmp_path} --resume" in interrupted(tmp_path)
+
+
+def test_a_size_that_was_asked_for_is_compared_with_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "run.cgs").write_bytes(bytes(131_200))
+    (folder / "training.json").write_text('{"steps": 40, "lmbda": 0.002}')
+    say_miss(folder, 130_000)
+    assert capsys.readouterr().out == "asked 130.0 kB, written 131.2 kB: +0.9 %\n"
+    facts = json.loads((folder / "training.json").read_text())
+    assert facts == {
+        "steps": 40,
+        "lmbda": 0.002,
+        "target_bytes": 130_000,
+        "bytes": 131_200,
+        "miss": pytest.approx(0.0092, abs=1e-4),
+    }
+    say_miss(folder, 80_000)
+    out = capsys.readouterr().out
+    assert "+64.0 %" in out and "131.2 kB is what these settings reached" in out
+
+
+def test_a_target_size_is_a_setting_of_the_run() -> None:
+    assert (
+        "training.target_bytes=1500000" in train("scene", "-o", "run", "--target-size", "1.5MB").assignments()
+    )
+    assert not [a for a in train("scene", "-o", "run").assignments() if "target_bytes" in a]

@@ -14,6 +14,7 @@ import compgs
 from compgs.cli import train as train_command
 from compgs.cli.main import main
 from compgs.cli.settings import with_settings
+from compgs.evaluation import camera_path
 from compgs.metrics import psnr, to_8bit
 from compgs.render import render
 from compgs.training import TrainingStatus
@@ -21,6 +22,7 @@ from compgs.training import TrainingStatus
 pytestmark = pytest.mark.slow
 
 STEPS = 40
+CIRCLE = {"frames": 3, "width": 64, "height": 48}
 OPTIONS = ["--preset", "quick", "--steps", str(STEPS), "--seed", "7"]
 
 
@@ -82,6 +84,30 @@ def test_held_out_views_are_recognizable_after_a_few_seconds(scene_folder: Path)
 def test_encoding_a_run_again_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
     in_a_new_process("encode", run, "-o", tmp_path / "again.cgs")
     assert (tmp_path / "again.cgs").read_bytes() == (run / "tiny.cgs").read_bytes()
+
+
+def test_a_run_and_its_file_become_the_same_smaller_file_and_the_loss_is_stated(
+    run: Path,
+    scene_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    smaller = ["--drop", "0.6", "--coarser", "2"]
+    assert main(["encode", str(run), "-o", str(tmp_path / "a.cgs"), *smaller]) == 0
+    of_run = capsys.readouterr().out
+    file = str(run / "tiny.cgs")
+    assert main(["encode", file, "-o", str(tmp_path / "b.cgs"), *smaller, "--scene", str(scene_folder)]) == 0
+    assert (tmp_path / "a.cgs").read_bytes() == (tmp_path / "b.cgs").read_bytes()
+    for out in (of_run, capsys.readouterr().out):
+        assert "the 35 training views" in out
+        assert "held-out photographs" in out and "new renderings against old ones" in out
+    monkeypatch.setattr(camera_path, "surround", lambda positions: camera_path.orbit(positions, **CIRCLE))
+    assert main(["encode", file, "-o", str(tmp_path / "c.cgs"), *smaller]) == 0
+    out = capsys.readouterr().out
+    assert "3 cameras around the scene" in out and "held-out" not in out
+    change = (tmp_path / "c.cgs").stat().st_size / (run / "tiny.cgs").stat().st_size - 1
+    assert change < 0 and f"{100 * change:+.1f} %" in out
 
 
 def test_symbols_do_not_depend_on_process_or_number_of_threads(run: Path, tmp_path: Path) -> None:

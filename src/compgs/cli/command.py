@@ -55,16 +55,8 @@ class FileArgument:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions:
-    """Which scene, and how it is read."""
-
-    scene: Annotated[Positional[Path | None], arg(metavar="SCENE", help_behavior_hint=NO_DEFAULT)] = None
-    """Folder of the scene: COLMAP (images/ and sparse/), Blender or nerfstudio (transforms*.json)."""
-
-    source: Annotated[
-        Path | None, arg(aliases=["-s", "--source-path"], metavar="SCENE", help_behavior_hint=NO_DEFAULT)
-    ] = None
-    """The same, spelled as 3DGS does."""
+class ReadingOptions:
+    """How a scene is read."""
 
     downscale: Annotated[int, arg(aliases=["-r", "--resolution"], metavar="N")] = 1
     """Read images N times smaller; images_N is used where it exists."""
@@ -80,10 +72,25 @@ class SceneOptions:
     ] = None
     """Color behind everything, 0 to 1; by default white for Blender scenes, else black."""
 
+    def source_at(self, path: Path, *, holdout: bool = True) -> SceneSource:
+        return SceneSource(str(path), self.downscale, self.images, self.test_every, holdout, self.background)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(ReadingOptions):
+    """Which scene, and how it is read."""
+
+    scene: Annotated[Positional[Path | None], arg(metavar="SCENE", help_behavior_hint=NO_DEFAULT)] = None
+    """Folder of the scene: COLMAP (images/ and sparse/), Blender or nerfstudio (transforms*.json)."""
+
+    source: Annotated[
+        Path | None, arg(aliases=["-s", "--source-path"], metavar="SCENE", help_behavior_hint=NO_DEFAULT)
+    ] = None
+    """The same, spelled as 3DGS does."""
+
     def scene_source(self, *, holdout: bool = True) -> SceneSource:
         """Raises UsageError if not exactly one scene was given."""
-        path = str(one_scene(self.scene, self.source))
-        return SceneSource(path, self.downscale, self.images, self.test_every, holdout, self.background)
+        return self.source_at(one_scene(self.scene, self.source), holdout=holdout)
 
 
 def one_scene(scene: Path | None, source: Path | None) -> Path:

@@ -8,6 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from compgs.evaluation.reduction import Reduction
     from compgs.evaluation.results import Results
 
 console = Console(highlight=False, soft_wrap=True)
@@ -89,3 +90,25 @@ def print_results(results: "Results") -> None:
     console.print(table)
     console.print()
     print_components(results.components, results.anchors, results.coupled_primitives)
+
+
+def print_reduction(reduction: "Reduction") -> None:
+    """What a file was, and what it lost by becoming smaller."""
+    before, after = reduction.before, reduction.after
+    table = Table(box=None, pad_edge=False)
+    for heading in ("", "before", "after", "change"):
+        table.add_column(heading, justify="left" if heading == "" else "right")
+    counts: dict[str, tuple[int, int]] = {
+        "bytes": (before.bytes, after.bytes),
+        "anchors": (before.anchors, after.anchors),
+        "coupled primitives": (before.coupled_primitives, after.coupled_primitives),
+    }
+    for name, (old, new) in counts.items():
+        table.add_row(name, f"{old:,}", f"{new:,}", f"{100 * (new / old - 1):+.1f} %")
+    if before.held_out_psnr is not None and after.held_out_psnr is not None:
+        quality = (before.held_out_psnr, after.held_out_psnr)
+        change = quality[1] - quality[0]
+        shown = (f"{quality[0]:.2f} dB", f"{quality[1]:.2f} dB", f"{change:+.2f} dB")
+        table.add_row("PSNR, held-out photographs", *shown)
+    console.print(table)
+    say(f"new renderings against old ones, {reduction.cameras} cameras: PSNR {reduction.psnr:.2f} dB")

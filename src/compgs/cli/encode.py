@@ -1,35 +1,64 @@
-"""`compgs encode`: the file of a finished run."""
+"""`compgs encode`: the file of a finished run, or a smaller one from a file."""
 
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from compgs.cli.command import ComputingCommand
-from compgs.cli.console import duration, print_components, say, size
-from compgs.cli.run_folder import CHECKPOINT_NAME, file_name
+from compgs.cli.command import ComputingCommand, ReadingOptions, UsageError
+from compgs.cli.console import duration, print_components, print_reduction, say, size
+from compgs.cli.inputs import check_bitstream, read_bitstream
+from compgs.cli.progress import counting
+from compgs.cli.run_folder import CHECKPOINT_NAME, SceneSource, file_name, load_settings
+from compgs.cli.scenes import read_scene
 from compgs.errors import CheckpointError
-from compgs.outputs import check_output_file
+from compgs.outputs import check_output_file, write_bytes
+
+if TYPE_CHECKING:
+    from compgs.cameras import Camera
+    from compgs.scene.views import View
 
 
 @dataclass(frozen=True, kw_only=True)
-class Encode(ComputingCommand):
-    """Write the .cgs file of a run that has been trained.
+class Encode(ComputingCommand, ReadingOptions):
+    """Write the .cgs file of a run that has been trained, or a smaller file from a .cgs file, without training.
 
-    Example
+    Smaller: --drop leaves out the coupled primitives that contribute least to images, --coarser rounds the anchors'
+    covariances to coarser steps. What that loses is shown: the new renderings against the old ones, from the views
+    that a scene was trained on or, where no scene is known, from cameras around it; and with a scene both files
+    against its held-out photographs. Give -r and the like as in training.
+
+    Examples
 
     compgs encode runs/garden -o garden.cgs
+
+    compgs encode garden.cgs -o small.cgs --drop 0.2 --coarser 2
+
+    compgs encode garden.cgs -o small.cgs --drop 0.2 --scene scenes/garden -r 4
     """
 
-    folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of the run."""
+    source: Annotated[Positional[Path], arg(metavar="RUN|FILE")]
+    """Folder of the run, or a .cgs file."""
 
     output: Annotated[
-        Path | None, arg(aliases=["-o"], metavar="FILE", help_behavior_hint="(default: RUN/RUN.cgs)")
+        Path | None,
+        arg(aliases=["-o"], metavar="FILE", help_behavior_hint="(default for a run: RUN/RUN.cgs)"),
     ] = None
     """The file to write."""
+
+    drop: Annotated[float, arg(metavar="SHARE")] = 0.0
+    """Share of the coupled primitives to leave out, 0 up to below 1; anchors that have none left go too."""
+
+    coarser: Annotated[float, arg(metavar="FACTOR")] = 1.0
+    """Factor on the step of the anchors' covariances, 1 to 64."""
+
+    scene: Annotated[
+        Path | None,
+        arg(metavar="SCENE", help_behavior_hint="(default for a run: its own, where it still is)"),
+    ] = None
+    """Scene whose views say what contributes and what is lost."""
 
     geometry: Literal["octree", "tmc3"] = "octree"
     """Anchor positions by the octree coder (smaller), or by G-PCC as in the paper: then `tmc3` must be on PATH, also
@@ -39,25 +68,98 @@ class Encode(ComputingCommand):
     """Replace a file that is there already."""
 
     def run(self) -> None:
-        if not self.folder.is_dir():
-            raise CheckpointError(
-                f"{self.folder}: there is no such folder; give the folder that `compgs train -o` wrote"
-            )
-        path = self.output or self.folder / file_name(self.folder)
-        check_output_file(path, overwrite=self.overwrite)
-        if not (self.folder / CHECKPOINT_NAME).is_file():
-            raise CheckpointError(
-                f"{self.folder}: has no {CHECKPOINT_NAME}; give the folder that `compgs train -o` wrote"
-            )
+        path = self.check()
         self.prepare()
-        from compgs.codec import encode
+        start = time.perf_counter()
+        data = self.encoded_run() if self.source.is_dir() else read_bitstream(self.source)
+        if self.reduces:
+            data = self.reduced(data)
+        write_bytes(path, data)
         from compgs.codec.reader import file_info
+
+        info = file_info(data)
+        say(f"{path}: {size(len(data))}, written after {duration(time.perf_counter() - start)}")
+        print_components({s.name: s.bytes for s in info.sections}, info.anchors, info.coupled)
+
+    @property
+    def reduces(self) -> bool:
+        return self.drop != 0.0 or self.coarser != 1.0
+
+    def check(self) -> Path:
+        """The file to write. Raises what can be said before anything is computed."""
+        if self.reduces:
+            from compgs.evaluation.reduction import check_reduction
+
+            check_reduction(self.drop, self.coarser)
+        if self.source.is_dir():
+            path = self.output or self.source / file_name(self.source)
+            check_output_file(path, overwrite=self.overwrite)
+            if not (self.source / CHECKPOINT_NAME).is_file():
+                raise CheckpointError(
+                    f"{self.source}: has no {CHECKPOINT_NAME}; give the folder that `compgs train -o` wrote"
+                )
+            return path
+        if not self.source.exists():
+            raise CheckpointError(
+                f"{self.source}: there is no such folder or file; give the folder that `compgs train -o` wrote, "
+                "or a .cgs file"
+            )
+        check_bitstream(self.source)
+        if not self.reduces:
+            raise UsageError(
+                f"{self.source} is a .cgs file already; give --drop or --coarser for a smaller one"
+            )
+        if self.output is None:
+            raise UsageError("no file to write was given: name it with -o")
+        check_output_file(self.output, overwrite=self.overwrite)
+        return self.output
+
+    def encoded_run(self) -> bytes:
+        from compgs.codec.encoder import to_content
+        from compgs.codec.writer import write_content
         from compgs.training import load_run
 
-        model = load_run(self.folder)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        start = time.perf_counter()
-        encoded = encode(model, path, overwrite=self.overwrite, geometry=self.geometry)
-        say(f"{path}: {size(encoded.bytes)}, encoded in {duration(time.perf_counter() - start)}")
-        sections = file_info(path.read_bytes()).sections
-        print_components({s.name: s.bytes for s in sections}, encoded.anchors, encoded.coupled)
+        return write_content(to_content(load_run(self.source)), self.geometry)
+
+    def reduced(self, data: bytes) -> bytes:
+        from compgs.evaluation.reduction import reduce_file
+
+        cameras, held_out, where = self.cameras(data)
+        say(f"what contributes, and what is lost: {where}")
+        with counting("looking at cameras") as progress:
+            data, reduction = reduce_file(
+                data,
+                drop=self.drop,
+                coarser=self.coarser,
+                cameras=cameras,
+                held_out=held_out,
+                geometry=self.geometry,
+                device=self.device,
+                progress=progress,
+            )
+        print_reduction(reduction)
+        return data
+
+    def cameras(self, data: bytes) -> "tuple[list[Camera], tuple[View, ...], str]":
+        """Cameras to judge with, held-out views, and which they are."""
+        source = self.scene_source()
+        if source is not None:
+            scene = read_scene(source)
+            # A scene of which every view is held out still says where people look from.
+            views = scene.train_views or scene.test_views
+            return [view.camera for view in views], scene.test_views, f"the {len(views)} training views"
+        from compgs.codec.reader import read_content
+        from compgs.evaluation.camera_path import surround
+
+        content = read_content(data)
+        cameras = [camera for _, camera in surround(content.coordinates * content.voxel_size)]
+        return cameras, (), f"{len(cameras)} cameras around the scene; --scene judges by photographs"
+
+    def scene_source(self) -> SceneSource | None:
+        """The scene that was given, or the run's own; none for a file alone, or if the run's scene has moved."""
+        if self.scene is not None:
+            return self.source_at(self.scene)
+        if not self.source.is_dir():
+            return None
+        own = load_settings(self.source).scene
+        return own if Path(own.path).exists() else None

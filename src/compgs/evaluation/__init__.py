@@ -2,6 +2,7 @@
 
 from compgs.evaluation.bd_rate import bd_rate
 from compgs.evaluation.measure import evaluate
+from compgs.evaluation.reduction import Reduction, reduce_file
 from compgs.evaluation.results import Results, ViewResult
 
-__all__ = ["Results", "ViewResult", "bd_rate", "evaluate"]
+__all__ = ["Reduction", "Results", "ViewResult", "bd_rate", "evaluate", "reduce_file"]

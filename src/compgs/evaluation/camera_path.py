@@ -132,3 +132,18 @@ def orbit(
         pose = look_at(eye, middle, axis)
         result.append((f"orbit {i}", Camera(pose, focal, focal, width / 2, height / 2, width, height)))
     return result
+
+
+def surround(positions: np.ndarray, *, width: int = 320, height: int = 240) -> list[tuple[str, Camera]]:
+    """72 cameras that see a scene as visitors would: three heights, near and far, all around; positions as in `orbit`.
+
+    For judging what matters in a scene of which nothing but the file is there.
+    """
+    return [
+        (f"{name}, {elevation:.0f} degrees high, {distance} radii away", camera)
+        for elevation in (0.0, 25.0, 50.0)
+        for distance in (1.2, 2.2)
+        for name, camera in orbit(
+            positions, frames=12, width=width, height=height, elevation=elevation, distance=distance
+        )
+    ]

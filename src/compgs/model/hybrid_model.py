@@ -86,9 +86,13 @@ class HybridModel:
             radii.scatter_reduce_(0, index, reach, "amax")
         return p.positions, radii
 
-    @torch.no_grad()
     def gaussians(self, camera: Camera, visible: Tensor | None = None) -> Gaussians:
         """What a camera sees. `visible` [N] bool: anchors to look at; all of them if not given."""
+        return self.drawn(camera, visible)[0]
+
+    @torch.no_grad()
+    def drawn(self, camera: Camera, visible: Tensor | None = None) -> tuple[Gaussians, Tensor]:
+        """What a camera sees (M Gaussians), and which coupled primitives they are ([M] int64, ascending)."""
         p = self.primitives
         center = torch.as_tensor(camera.center, dtype=p.positions.dtype, device=p.positions.device)
         if visible is None:
@@ -98,7 +102,7 @@ class HybridModel:
         parts = [self._appearance(anchors, center) for anchors in chosen.split(BLOCK)]
         drawn, opacities, colors = (torch.cat(part) for part in zip(*parts, strict=True))
         means, scales, quaternions = (array.index_select(0, drawn) for array in self.geometry)
-        return Gaussians(means, quaternions, scales, opacities, colors)
+        return Gaussians(means, quaternions, scales, opacities, colors), drawn
 
     def _appearance(
         self,

@@ -18,7 +18,8 @@ FIRST_LOOK = (
     0.1  # of the run after the rate has joined the loss: the entropy networks begin by knowing nothing
 )
 GROWING = 0.2  # integral gain of a look while anchors grow
-SETTLING = (2.0, 10.0)  # integral and proportional gain after growth
+SHRINKS = 0.1  # log of the share by which a file shrinks after growth at one lambda (plush_480, 2 000 steps)
+SETTLING = (3.0, 10.0)  # integral and proportional gain after growth
 SLOW_FROM = 0.85  # of the run: from here on the integral gain falls to zero at the end
 LARGEST_STEP = math.log(1.6)  # of log lambda in one look
 
@@ -43,7 +44,7 @@ def follow(state: RateState, size: float, target: float, *, progress: float, gro
     """
     error = math.log(size / target)
     if not grown:
-        return replace(state, lmbda=_moved(state.lmbda, GROWING * error))
+        return replace(state, lmbda=_moved(state.lmbda, GROWING * (error - SHRINKS)))
     integral, proportional = SETTLING
     if progress > SLOW_FROM:
         integral *= (1.0 - progress) / (1.0 - SLOW_FROM)

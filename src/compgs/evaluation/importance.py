@@ -1,0 +1,28 @@
+"""What a coupled primitive contributes to the images of a scene."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from compgs.cameras import Camera
+from compgs.model.hybrid_model import HybridModel
+from compgs.render import RasterSettings, contributions, visible_mask
+
+
+def importance(
+    model: HybridModel, cameras: Sequence[Camera], progress: Callable[[int, int], None] | None = None
+) -> Tensor:  # [P] float64, pixels
+    """Blending weights (transmittance x alpha) of each coupled primitive, summed over pixels and cameras.
+
+    `progress(done, total)` is called after each camera.
+    """
+    settings = RasterSettings(background=model.background)
+    total = torch.zeros(model.coupled, dtype=torch.float64, device=model.primitives.positions.device)
+    for i, camera in enumerate(cameras):
+        gaussians, drawn = model.drawn(camera, visible_mask(*model.bounds, camera, settings))
+        # No atomics: `drawn` names each primitive once, so the sum is the same in every run.
+        total[drawn] += contributions(gaussians, camera, settings).double()
+        if progress:
+            progress(i + 1, len(cameras))
+    return total
