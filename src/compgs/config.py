@@ -23,6 +23,7 @@ class ModelConfig:
     coupled_primitives: int = 10  # K, per anchor (Sec. 3.4)
     reference_dim: int = 32  # channels of a reference embedding (Sec. 3.4)
     residual_dim: int = 8  # channels of a residual embedding (Sec. 3.4)
+    residuals: bool = True  # False: the K residual embeddings are the same for all anchors (ablation, Tab. 5)
     width: int = 32  # hidden width of the residual MLPs (Ref.)
     heads: Literal["separate", "paired"] = (
         "paired"  # separate: four networks (Sec. 3.2); paired: geometry, appearance
@@ -46,6 +47,7 @@ class EntropyConfig:
     residual_step: float = 0.5  # quantization step of residual embeddings (1 in Sec. 3.4)
     covariance_step: float = 0.05  # initial learned step of the anchors' log scales; 0.01 in the paper starts
     #   on the likelihood floor in short runs
+    quantized: bool = True  # False: latents are trained unrounded, as a bound that no file reaches (ablation)
     network_hidden: int = 0  # hidden width of the entropy networks; 0: one linear layer (Ref.)
     network_bits: int = (
         13  # of the entropy networks' weights in the file: 0.1 % of the bits at 12, 0.006 % at 14
@@ -74,7 +76,9 @@ class TrainingConfig:
 
     steps: int = 30_000  # one view each
     seed: int = 0
-    lmbda: float = 0.001  # weight of the rate
+    lmbda: float = (
+        0.001  # weight of the rate; 0: the entropy networks learn what the latents cost, these do not care
+    )
     target_bytes: int | None = None  # size of the file to aim at: lambda, from its setting on, follows it
     rate: Literal["bits", "elements"] = (
         "bits"  # bits: true bits, normalized so that lambda means the same as in

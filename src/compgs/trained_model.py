@@ -52,6 +52,8 @@ class TrainedModel(nn.Module):
         self.log_scales = nn.Parameter(torch.zeros(n, 6))
         self.references = nn.Parameter(torch.zeros(n, m.reference_dim))
         self.residuals = nn.Parameter(self.entropy.starting_residuals().repeat(n, 1))
+        if not m.residuals:
+            self.entropy.expect_constant_residuals()
 
     @property
     def anchors(self) -> int:
@@ -65,6 +67,15 @@ class TrainedModel(nn.Module):
         """[N, 3] float32 world units, of the given anchors or all."""
         coordinates = self.coordinates if rows is None else self.coordinates[rows]
         return coordinates.to(torch.float32) * self.voxel_size
+
+    def share_residuals(self) -> None:
+        """Without residual embeddings of their own, all anchors have those of the first, which alone learn.
+
+        The file has them as what it expects: no symbol is other than zero.
+        """
+        with torch.no_grad():
+            self.residuals[1:] = self.residuals[0]
+            self.entropy.residual_network.biases[-1][: self.residuals.shape[1]] = self.residuals[0]
 
     def quantized(
         self,
@@ -83,16 +94,23 @@ class TrainedModel(nn.Module):
         def chosen(parameter: Tensor) -> Tensor:
             return parameter if rows is None else parameter.index_select(0, rows)
 
-        bits = self.config.entropy.network_bits if stored_weights else None
-        return self.entropy(
+        e = self.config.entropy
+        references, covariances = (
             chosen(self.references),
             chosen(self.log_scales) / self.entropy.covariance_step,
-            chosen(self.residuals),
+        )
+        own = self.config.model.residuals
+        residuals = chosen(self.residuals) if own else self.residuals[:1].expand(len(references), -1)
+        latents = self.entropy(
+            references,
+            covariances,
+            residuals,
             rate=rate,
             noise=noise,
-            network_bits=bits,
+            network_bits=e.network_bits if stored_weights else None,
             mask=chosen(self.mask) if masked else None,
         )
+        return latents if e.quantized else Quantized(references, covariances, residuals, latents.bits)
 
     def primitives(self, latents: Quantized, rows: Tensor | None = None) -> Primitives:
         """Dequantize: all K coupled primitives of the given anchors, as prediction sees them."""

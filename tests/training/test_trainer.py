@@ -118,3 +118,56 @@ def test_views_that_all_look_elsewhere_are_an_error_before_any_step(blob_scene, 
 def test_no_training_views_is_a_settings_error(blob_scene, tiny_config):
     with pytest.raises(ConfigError, match="no training views"):
         train(replace(blob_scene, train_views=()), tiny_config)
+
+
+def test_without_a_rate_term_only_the_statistics_learn_from_the_rate(blob_scene, tiny_config):
+    """Latents go the same way whether the rate is counted or not; the entropy networks do not stand still."""
+    config = replace(tiny_config, training=replace(tiny_config.training, steps=40, lmbda=0.0, rate_start=0.1))
+    never = replace(config, training=replace(config.training, rate_start=1.0))
+    counted, not_counted = Trainer(blob_scene, config, CPU), Trainer(blob_scene, never, CPU)
+    for trainer in (counted, not_counted):
+        trainer.noise = torch.zeros_like  # drawing noise would change the order of the views
+        before = trainer.model.entropy.covariance_network.weights[0].detach().clone()
+        for _ in range(
+            5
+        ):  # the first steps: later, the means that are learned move the places of the rounding
+            trainer.train_step()
+        learned = not torch.equal(before, trainer.model.entropy.covariance_network.weights[0])
+        assert learned == (trainer is counted)
+    assert torch.equal(counted.model.references, not_counted.model.references)
+    assert torch.equal(counted.model.residuals, not_counted.model.residuals)
+
+
+def test_without_residual_embeddings_all_anchors_have_the_same_and_the_file_has_none(
+    blob_scene, tiny_config, tmp_path
+):
+    from compgs.codec import encode
+    from compgs.codec.reader import file_info
+
+    config = replace(
+        tiny_config,
+        model=replace(tiny_config.model, residuals=False),
+        training=replace(tiny_config.training, steps=60),
+    )
+    trainer = Trainer(blob_scene, config, CPU)
+    start = trainer.model.residuals[0].detach().clone()
+    trainer.run(None, None)
+    residuals = trainer.model.residuals.detach()
+    assert torch.equal(residuals, residuals[:1].expand_as(residuals))
+    assert not torch.equal(residuals[0], start), "they learn"
+    encode(trainer.model, tmp_path / "a.cgs")
+    sections = {s.name: s.bytes for s in file_info((tmp_path / "a.cgs").read_bytes()).sections}
+    assert sections["residual embeddings"] < 60 and sections["residual hyperprior"] < 60
+
+
+def test_unquantized_latents_are_rendered_as_they_are(blob_scene, tiny_config):
+    config = replace(tiny_config, entropy=replace(tiny_config.entropy, quantized=False))
+    trainer = Trainer(blob_scene, config, CPU)
+    trainer.run(None, None)
+    model = trainer.model
+    shown = model.as_hybrid_model(stored_weights=False).primitives
+    kept = model.mask.view(-1)
+    step = config.entropy.reference_step
+    assert torch.equal(shown.references, model.references.detach() * step)
+    flat = model.residuals.detach().view(len(kept), -1)
+    assert torch.equal(shown.residuals, flat[kept] * config.entropy.residual_step)

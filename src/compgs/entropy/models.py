@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy.factorized import FactorizedDensity
 from compgs.entropy.gaussian import gaussian_bits
-from compgs.entropy.network import NEGATIVE_SLOPE, EntropyNetwork
+from compgs.entropy.network import NEGATIVE_SLOPE, OCTAVE, UNIT_SCALE, EntropyNetwork
 from compgs.entropy.quantization import quantize, round_straight_through
 
 STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")
@@ -86,6 +86,10 @@ class EntropyModel(nn.Module):
         """The networks that the decoder needs, and so the file holds."""
         return self.reference_network, self.covariance_network, self.residual_network
 
+    def statistics(self) -> list[nn.Parameter]:
+        """Parameters that say what latents cost, and nothing about what they are."""
+        return [p for name, p in self.named_parameters() if name != "log_covariance_step" and p.requires_grad]
+
     @torch.no_grad()
     def fit_covariance_prior(self, log_scales: Tensor) -> None:
         """Start the covariance prior at the data's mean and spread: from zero it would start without gradient."""
@@ -98,6 +102,16 @@ class EntropyModel(nn.Module):
         """[K * residual_dim] residual embedding that a new anchor starts with, in quantization steps."""
         channels = self.residual_network.channels
         return self.residual_network.biases[-1].detach()[:channels].clone()
+
+    @torch.no_grad()
+    def expect_constant_residuals(self) -> None:
+        """Residual embeddings are what the last bias says, and cost nothing: the smallest scale."""
+        network = self.residual_network
+        means = network.biases[-1][: network.channels].clone()
+        for parameter in network.parameters():
+            parameter.requires_grad_(False).zero_()
+        network.biases[-1][: network.channels] = means
+        network.biases[-1][network.channels :] = -UNIT_SCALE / OCTAVE
 
     def forward(
         self,

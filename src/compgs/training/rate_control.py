@@ -19,8 +19,8 @@ FIRST_LOOK = (
 )
 GROWING = 0.2  # integral gain of a look while anchors grow
 SHRINKS = 0.1  # log of the share by which a file shrinks after growth at one lambda (plush_480, 2 000 steps)
-SETTLING = (3.0, 10.0)  # integral and proportional gain after growth
-SLOW_FROM = 0.85  # of the run: from here on the integral gain falls to zero at the end
+SETTLING = (2.0, 15.0)  # integral and proportional gain after growth
+SLOW_FROM = 0.92  # of the run: from here on the integral gain falls to zero at the end
 LARGEST_STEP = math.log(1.6)  # of log lambda in one look
 
 

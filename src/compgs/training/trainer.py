@@ -172,7 +172,11 @@ class Trainer:
         profile.lap("loss")
         if latents.bits:
             elements = self.elements(len(rows))
-            loss = rate_distortion_loss(loss, rate(latents.bits, elements, t.rate), self.rate.lmbda)
+            r = rate(latents.bits, elements, t.rate)
+            if self.rate.lmbda > 0:
+                loss = rate_distortion_loss(loss, r, self.rate.lmbda)
+            else:
+                r.backward(inputs=self.model.entropy.statistics(), retain_graph=True)
         profile.lap("entropy")
         profile.lap_on_gradient("loss, backward", rendered.image)
         profile.lap_on_gradient("rasterization, backward", rendered.means2d)
@@ -188,6 +192,8 @@ class Trainer:
         set_learning_rates(self.optimizer, progress, t.head_warm_up)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
+        if not self.config.model.residuals:
+            self.model.share_residuals()
         profile.lap("optimizer")
         if self.schedule.active(self.step):
             gradient = rendered.means2d.grad
