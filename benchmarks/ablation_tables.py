@@ -1,0 +1,196 @@
+"""Tables of the ablations: variants over seeds, components, curves."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean, stdev
+from typing import Any
+
+from compgs.errors import ConfigError
+from compgs.evaluation.bd_rate import bd_rate
+
+COUPLED_COMPONENTS = ("masks", "residual hyperprior", "residual embeddings")
+ANCHOR_COMPONENTS = ("positions", "reference hyperprior", "reference embeddings", "covariance")
+
+Record = dict[str, Any]  # what `ablation.run_variant` knows of one finished variant and seed
+
+
+@dataclass(frozen=True)
+class Row:
+    """A variant over its seeds: means, and the standard deviation where there are several."""
+
+    label: str
+    curve: str
+    psnr: float
+    psnr_spread: float | None
+    ssim: float
+    lpips: float | None
+    bytes: float | None  # None: no file holds it
+    anchors: float | None
+    coupled_primitives: float | None
+    seconds: float
+    components: dict[str, float]  # bytes
+
+
+def rows_of(records: Sequence[Record]) -> list[Row]:
+    """In the order in which the variants first come; a row more for a model evaluated unrounded."""
+    rows = []
+    for name in dict.fromkeys(record["variant"] for record in records):
+        mine = [record for record in records if record["variant"] == name]
+        if "unrounded" in mine[0]:
+            psnr = [record["unrounded"]["psnr"] for record in mine]
+            ssim = fmean(record["unrounded"]["ssim"] for record in mine)
+            label = "trained unrounded, never rounded (no file)"
+            rows.append(
+                Row(label, "", fmean(psnr), _spread(psnr), ssim, None, None, None, None, _seconds(mine), {})
+            )
+        results = [record["results"] for record in mine]
+        psnr = [result["psnr"] for result in results]
+        components = list(dict.fromkeys(name for result in results for name in result["components"]))
+        rows.append(
+            Row(
+                label=mine[0]["label"],
+                curve=mine[0]["curve"],
+                psnr=fmean(psnr),
+                psnr_spread=_spread(psnr),
+                ssim=_mean(results, "ssim"),
+                lpips=None if any(r.get("lpips") is None for r in results) else _mean(results, "lpips"),
+                bytes=_mean(results, "bytes"),
+                anchors=_mean(results, "anchors"),
+                coupled_primitives=_mean(results, "coupled_primitives"),
+                seconds=_seconds(mine),
+                components={c: fmean(r["components"].get(c, 0) for r in results) for c in components},
+            )
+        )
+    return rows
+
+
+def _mean(results: Sequence[Record], key: str) -> float:
+    return fmean(result.get(key) or 0 for result in results)
+
+
+def _spread(values: Sequence[float]) -> float | None:
+    return stdev(values) if len(values) > 1 else None
+
+
+def _seconds(records: Sequence[Record]) -> float:
+    return fmean(record["seconds"] for record in records)
+
+
+def paired_differences(records: Sequence[Record]) -> list[str]:
+    """PSNR of each variant minus that of the first with the same seed: mean and spread over the seeds."""
+
+    def psnr(name: str, key: str) -> dict[int, float]:
+        return {r["seed"]: r[key]["psnr"] for r in records if r["variant"] == name and key in r}
+
+    first, *others = dict.fromkeys(record["variant"] for record in records)
+    reference = psnr(first, "results")
+    lines = []
+    for name in others:
+        for key, note in (("unrounded", " (never rounded)"), ("results", "")):
+            theirs = psnr(name, key)
+            differences = [theirs[seed] - reference[seed] for seed in reference if seed in theirs]
+            if not differences:
+                continue
+            spread = _spread(differences)
+            over = f" ± {spread:.2f}" if spread is not None else ""
+            lines.append(
+                f"{name}{note} minus {first}, same seeds: {fmean(differences):+.2f}{over} dB over {len(differences)}"
+            )
+    return lines
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Markdown."""
+    with_lpips = any(row.lpips is not None for row in rows)
+    head = [
+        "",
+        "PSNR (dB)",
+        "SSIM",
+        *(["LPIPS"] if with_lpips else []),
+        "bytes",
+        "anchors",
+        "primitives",
+        "s",
+    ]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for row in rows:
+        spread = f" ± {row.psnr_spread:.2f}" if row.psnr_spread is not None else ""
+        lpips = [] if not with_lpips else ["" if row.lpips is None else f"{row.lpips:.3f}"]
+        counts = [row.bytes, row.anchors, row.coupled_primitives]
+        cells = [row.label, f"{row.psnr:.2f}{spread}", f"{row.ssim:.4f}", *lpips]
+        cells += ["none" if c is None else f"{c:,.0f}" for c in counts]
+        lines.append("| " + " | ".join([*cells, f"{row.seconds:.0f}"]) + " |")
+    return "\n".join(lines)
+
+
+def component_table(rows: Sequence[Row]) -> str:
+    """Markdown: bytes of each component, and bits per anchor and per coupled primitive (paper, bitstream analysis)."""
+    names = list(dict.fromkeys(name for row in rows for name in row.components))
+    lines = ["| component | " + " | ".join(row.label for row in rows) + " |", "|---|" + "---|" * len(rows)]
+    lines += [
+        f"| {name} | " + " | ".join(f"{row.components.get(name, 0):,.0f}" for row in rows) + " |"
+        for name in names
+    ]
+    for name, pick in (("bits per anchor primitive", 0), ("bits per coupled primitive", 1)):
+        lines.append(f"| {name} | " + " | ".join(f"{bits_each(row)[pick]:.1f}" for row in rows) + " |")
+    return "\n".join(lines)
+
+
+def bits_each(row: Row) -> tuple[float, float]:
+    """Bits per anchor primitive and per coupled primitive, of their own components; networks belong to neither."""
+    anchor = 8 * sum(row.components.get(name, 0) for name in ANCHOR_COMPONENTS)
+    coupled = 8 * sum(row.components.get(name, 0) for name in COUPLED_COMPONENTS)
+    return anchor / max(row.anchors or 0, 1), coupled / max(row.coupled_primitives or 0, 1)
+
+
+def curves_of(rows: Sequence[Row]) -> dict[str, list[tuple[float, float]]]:
+    """(bytes, PSNR) of each curve."""
+    return {
+        curve: [(row.bytes, row.psnr) for row in rows if row.curve == curve and row.bytes is not None]
+        for curve in dict.fromkeys(row.curve for row in rows if row.curve)
+    }
+
+
+def compare_curves(rows: Sequence[Row]) -> list[str]:
+    """BD-rate of every curve against the first, and which curves are not monotone."""
+    curves = curves_of(rows)
+    first, *others = curves
+    lines = []
+    for name, curve in curves.items():
+        ordered = sorted(curve)
+        monotone = all(a[1] < b[1] for a, b in itertools.pairwise(ordered))
+        lines.append(f"{name}: PSNR {'rises' if monotone else 'does not always rise'} with the bytes")
+    for name in others:
+        try:
+            lines.append(
+                f"BD-rate of {name} against {first}: {100 * bd_rate(curves[first], curves[name]):+.1f} %"
+            )
+        except ConfigError as reason:
+            lines.append(f"BD-rate of {name} against {first}: none ({reason})")
+    return lines
+
+
+def report(name: str, scene: str, records: Sequence[Record], command: str) -> str:
+    """The Markdown file."""
+    rows = rows_of(records)
+    first = records[0]
+    m, r = first["machine"], first["results"]
+    commits = ", ".join(dict.fromkeys(record["commit"] for record in records))
+    seeds = ", ".join(str(seed) for seed in dict.fromkeys(record["seed"] for record in records))
+    steps = ", ".join(dict.fromkeys(str((record["training"] or {}).get("steps", "?")) for record in records))
+    parts = [
+        f"# Ablation: {name} on {scene}",
+        f"`{command}`",
+        f"Decoded files on {r['views']} held-out views, {r['width']} x {r['height']} pixels; {steps} steps; seeds "
+        f"{seeds}; commit {commits}; {m['processor']}, {m['cores']} cores, {r['threads']} threads. Seconds are of the "
+        "whole command, on a machine that may have had other work.",
+        table(rows),
+    ]
+    if name == "bitstream":
+        parts.append(component_table(rows))
+    notes = paired_differences(records) if name == "quantization" else []
+    notes += compare_curves(rows) if name == "curve" else []
+    parts += ["\n".join(f"- {note}" for note in notes)] if notes else []
+    parts.append(f"![{name}](ablation_{name}_{scene}.png)")
+    return "\n\n".join(parts) + "\n"
