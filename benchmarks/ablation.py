@@ -234,6 +234,9 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("-r", "--downscale", type=int, default=1)
     parser.add_argument("--threads", type=int)
     parser.add_argument("--lpips", action="store_true")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="of all variants"
+    )
     return parser.parse_args(arguments)
 
 
@@ -243,7 +246,7 @@ def common_arguments(options: argparse.Namespace) -> list[str]:
     result = ["-r", str(options.downscale)]
     for name, value in given.items():
         result += [name, str(value)] if value is not None else []
-    return result + (["--lpips"] if options.lpips else [])
+    return [*result, *_set(*options.set), *(["--lpips"] if options.lpips else [])]
 
 
 def main(arguments: Sequence[str] | None = None, run: Callable[[list[str]], None] = run_compgs) -> None:
