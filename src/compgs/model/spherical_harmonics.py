@@ -98,16 +98,26 @@ class _ViewColors(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, center: Tensor, degree: int, visible: Tensor
     ) -> Tensor:
-        arrays = [t.detach().contiguous() for t in (means, dc, rest, center, visible)]
-        colors = torch.empty_like(arrays[0])
-        _colors(*(a.numpy() for a in arrays), degree, colors.numpy())
-        ctx.save_for_backward(*arrays, colors)
+        means, dc, rest, center, visible = (
+            t.detach().contiguous() for t in (means, dc, rest, center, visible)
+        )
+        colors = torch.empty_like(means)
+        _colors(
+            means.numpy(),
+            dc.numpy(),
+            rest.numpy(),
+            center.numpy(),
+            visible.numpy(),
+            degree,
+            colors.numpy(),
+        )
+        ctx.save_for_backward(means, dc, rest, center, colors)
         ctx.degree = degree
         return colors
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        means, dc, rest, center, _, colors = ctx.saved_tensors
+        means, dc, rest, center, colors = ctx.saved_tensors
         d_means, d_dc, d_rest = (torch.empty_like(t) for t in (means, dc, rest))
         _colors_gradient(
             means.numpy(),

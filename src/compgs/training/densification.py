@@ -1,14 +1,13 @@
 """Adaptive density control of plain 3DGS (Kerbl et al. 2023, Sec. 5.2): clone, split, prune, reset opacities.
 
 Where the image still pulls at a splat's 2D mean, small splats are cloned and large ones split in two; transparent
-splats are removed, and after the first reset of the opacities also those that are too large for the scene. The published
-program also removes splats that are large in the image; gsplat by default does not, and neither do we.
+splats are removed, and after the first reset of the opacities also those that are too large for the scene. (The
+published program also removes what is large in the image; gsplat by default does not, and neither do we.)
 
-The published schedule counts steps of a run of 30 000 on a few hundred views. As mere fractions of a short run, it would
-judge splats that no view has shown since, and reset opacities faster than they recover. So there are floors: one
-pass over the views between two judgements, `RECOVERY_PASSES` between two resets, and no reset without the time to
-recover from it before densification ends. For 30 000 steps on up to 100 views nothing of this differs from what was
-published.
+The published schedule counts steps of a run of 30 000. As mere fractions of a short run, it would judge splats that no
+view has shown since, and reset opacities faster than they recover. So there are floors: a pass over the views between
+two judgements, `RECOVERY_PASSES` between two resets, and no reset without the time to recover from it before
+densification ends. Floors end at the published numbers of steps: a run of 30 000 steps goes as published.
 """
 
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ from compgs.config import SplatConfig
 from compgs.model.splats import Splats
 from compgs.training.splat_parameters import SplatParameters, replace_splats
 
+PUBLISHED_START, PUBLISHED_EVERY, PUBLISHED_RESET = 500, 100, 3_000  # steps
 RECOVERY_PASSES = 5  # over the views: opacities are back after some hundred steps in which a splat is seen
 SPLIT_INTO = 2
 SPLIT_SHRINK = 1.6  # 0.8 x the number of parts: how much smaller a part is
@@ -51,10 +51,10 @@ class DensifySchedule:
 def densify_schedule(config: SplatConfig, steps: int, views: int) -> DensifySchedule:
     """Fractions of the run in steps; see the module's docstring for the floors."""
     return DensifySchedule(
-        start=max(1, round(config.densify_start * steps), views),
+        start=max(1, round(config.densify_start * steps), min(views, PUBLISHED_START)),
         stop=round(config.densify_stop * steps),
-        every=max(1, round(config.densify_every * steps), views),
-        reset_every=max(1, round(config.reset_every * steps), RECOVERY_PASSES * views),
+        every=max(1, round(config.densify_every * steps), min(views, PUBLISHED_EVERY)),
+        reset_every=max(1, round(config.reset_every * steps), min(RECOVERY_PASSES * views, PUBLISHED_RESET)),
     )
 
 

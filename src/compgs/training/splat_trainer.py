@@ -190,7 +190,7 @@ class SplatTrainer:
     # checkpoints ---------------------------------------------------------------------------------------------------
 
     def save(self, path: Path) -> None:
-        tensors = {f"model/{name}": p for name, p in self.parameters.named_parameters()}
+        tensors = {f"model/{name}": p for name, p in vars(self.parameters.trained()).items()}
         moments = optimizer_tensors(self.parameters, self.optimizer)
         tensors |= {f"optimizer/{name}": value for name, value in moments.items()}
         tensors |= {f"extra/control/{n}": getattr(self.control, n) for n in DensityControl.STATISTICS}
