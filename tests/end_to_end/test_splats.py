@@ -17,7 +17,7 @@ from compgs.training import TrainingStatus
 
 pytestmark = pytest.mark.slow
 
-STEPS = 400
+STEPS = 250
 OPTIONS = [
     "--method",
     "3dgs",
@@ -100,7 +100,7 @@ def test_a_run_that_was_stopped_continues_to_the_same_file(
     @contextmanager
     def stopped_on_the_way() -> Iterator[Callable[[TrainingStatus], None]]:
         def stop(status: TrainingStatus) -> None:
-            if status.step >= 200:
+            if status.step >= 120:
                 raise KeyboardInterrupt
 
         yield stop

@@ -147,4 +147,4 @@ def restore_optimizer(model: nn.Module, optimizer: torch.optim.Optimizer, tensor
     for name, value in tensors.items():
         parameter, key = name.rsplit("/", 1)
         state = optimizer.state.setdefault(parameters[parameter], {})
-        state[key] = value if key == "step" else value.to(parameters[parameter].device)
+        state[key] = value.to(parameters[parameter].device)  # (fused Adam has its step there, too)
