@@ -134,7 +134,8 @@ class SplatTrainer:
         profile.lap("loss")
         profile.lap_on_gradient("loss, backward", rendered.image)
         profile.lap_on_gradient("rasterization, backward", rendered.means2d)
-        profile.lap_on_gradient("projection, backward", gaussians.scales)
+        # Autograd goes back in the opposite order: through the projection, then through the harmonics.
+        profile.lap_on_gradient("projection, backward", gaussians.colors)
         loss.backward()
         profile.lap("activation and harmonics, backward")
 
