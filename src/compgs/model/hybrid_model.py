@@ -4,11 +4,13 @@ import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
+from compgs.model.appearance import block_count, gather_drawn, predict_appearance
 from compgs.model.prediction import OPACITY_CUTOFF, PredictionHeads, affine_transform, view_embedding
 from compgs.model.primitives import Primitives
 
@@ -95,9 +97,46 @@ class HybridModel:
             chosen = torch.arange(len(p), device=p.positions.device)
         else:
             chosen = torch.nonzero(visible).view(-1)
+        fused = p.positions.device.type == "cpu" and p.residuals.dtype == torch.float32
+        if fused and self.heads.layout == "paired":
+            return self._fused_gaussians(chosen, center)
         parts = [self._appearance(anchors, center) for anchors in chosen.split(BLOCK)]
         drawn, opacities, colors = (torch.cat(part) for part in zip(*parts, strict=True))
         means, scales, quaternions = (array.index_select(0, drawn) for array in self.geometry)
+        return Gaussians(means, quaternions, scales, opacities, colors)
+
+    @functools.cached_property
+    def _appearance_arrays(self) -> tuple[np.ndarray, ...]:
+        return self.heads.appearance.arrays()
+
+    def _fused_gaussians(
+        self,
+        anchors: Tensor,  # [V] int64, ascending
+        center: Tensor,  # [3] of the camera, world units
+    ) -> Gaussians:
+        """What `_appearance` and gathers of the geometry give, by compiled kernels."""
+        p, first = self.primitives, self.first_coupled
+        counts = first.index_select(0, anchors + 1) - first.index_select(0, anchors)
+        places = nn.functional.pad(counts.cumsum(0), (1, 0))
+        appearance = np.empty((int(places[-1]), 4), np.float32)
+        drawn = np.zeros(block_count(len(anchors)), np.int64)
+        where = anchors.numpy(), first.numpy(), places.numpy()
+        predict_appearance(
+            *where,
+            *(t.contiguous().numpy() for t in (p.positions, p.references, p.residuals, center)),
+            np.float32(self.distance_unit),
+            np.float32(OPACITY_CUTOFF),
+            *self._appearance_arrays,
+            appearance,
+            drawn,
+        )
+        offsets = np.concatenate([[0], np.cumsum(drawn)])
+        m = int(offsets[-1])
+        means, scales, quaternions, colors = (p.positions.new_empty(m, size) for size in (3, 3, 4, 3))
+        opacities = p.positions.new_empty(m)
+        geometry = (t.numpy() for t in self.geometry)
+        made = (t.numpy() for t in (means, scales, quaternions, opacities, colors))
+        gather_drawn(*where, appearance, offsets, *geometry, *made)
         return Gaussians(means, quaternions, scales, opacities, colors)
 
     def _appearance(
