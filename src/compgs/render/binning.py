@@ -56,7 +56,38 @@ class TileLists:
     slots: np.ndarray  # [..] int32: the splats' entries, splat by splat (with gaps)
 
 
+@dataclass(frozen=True, eq=False)
+class PackedSplats:
+    """M splats as blending reads them, and the tiles that each one touches. Rows of invisible splats are not set."""
+
+    visible: np.ndarray  # [M] bool
+    packed: np.ndarray  # [M, PARAMETERS] float32
+    first_slot: np.ndarray  # [M] int32
+    slots_used: np.ndarray  # [M] int32
+    slots: np.ndarray  # [..] int32: tiles, splat by splat (with gaps)
+    rows: np.ndarray  # [..] int32: first and last row within the tile (first * 256 + last)
+    counts: np.ndarray  # [CHUNKS, tiles] int64: slots of each chunk of splats, by tile
+
+
 def bin_splats(
+    means2d: np.ndarray,
+    covariances: np.ndarray,
+    determinants: np.ndarray,
+    depths: np.ndarray,
+    opacities: np.ndarray,
+    colors: np.ndarray,
+    width: int,
+    height: int,
+    settings: RasterSettings,
+) -> TileLists:
+    """The lists of all tiles; arguments as those of `pack_splats`."""
+    splats = pack_splats(
+        means2d, covariances, determinants, depths, opacities, colors, width, height, settings
+    )
+    return list_tiles(splats, depths)
+
+
+def pack_splats(
     means2d: np.ndarray,  # [M, 2] pixels
     covariances: np.ndarray,  # [M, 3] pixels^2
     determinants: np.ndarray,  # [M] pixels^4
@@ -66,8 +97,8 @@ def bin_splats(
     width: int,
     height: int,
     settings: RasterSettings,
-) -> TileLists:
-    """The lists of all tiles. Raises MemoryError for splats that would need absurd amounts of it."""
+) -> PackedSplats:
+    """Raises MemoryError for splats that would need absurd amounts of it."""
     m = len(means2d)
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     log2_cutoff = f32(math.log2(settings.alpha_cutoff))
@@ -90,16 +121,19 @@ def bin_splats(
         means2d, covariances, determinants, colors, log2_cutoff, tiles_x,
         visible, boxes, room, packed, slots, rows, first_slot, slots_used, counts,
     )  # fmt: skip
-    del boxes  # the peak of memory comes next
+    return PackedSplats(visible, packed, first_slot, slots_used, slots, rows, counts)
 
-    starts = np.empty(tiles_x * tiles_y + 1, np.int64)
-    total = start_tiles(counts, starts)
+
+def list_tiles(splats: PackedSplats, depths: np.ndarray) -> TileLists:
+    """The lists of all tiles. The slots and counts of `splats` are used up: they become those of the lists."""
+    s = splats
+    starts = np.empty(s.counts.shape[1] + 1, np.int64)
+    total = start_tiles(s.counts, starts)
     entries, keys = np.empty((total, 2), np.int32), np.empty(total, np.uint32)
-    fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, entries, keys)
-    del rows
+    fill_tiles(s.visible, depths, s.first_slot, s.slots_used, s.slots, s.rows, s.counts, entries, keys)
     order = np.empty(total, np.int32)
     sort_tiles(starts, keys, order)
-    return TileLists(visible, packed, starts, entries, order, first_slot, slots_used, slots)
+    return TileLists(s.visible, s.packed, starts, entries, order, s.first_slot, s.slots_used, s.slots)
 
 
 @njit(inline="always")
