@@ -64,15 +64,15 @@ class ResidualMLP(nn.Module):
     ) -> Tensor:  # [M, outputs]
         anchor_entry, entry, bias = self._entry()
         shared = torch.addmm(bias, anchor_features, anchor_entry)
-        if residuals.device.type == "cpu" and residuals.dtype == torch.float32:
+        if shared.device.type == "cpu" and shared.dtype == residuals.dtype == torch.float32:
             return _FusedMLP.apply(shared, residuals, anchor_index, *self._after_entry(entry))
-        first = torch.addmm(shared.index_select(0, anchor_index), residuals, entry)
+        first = torch.addmm(shared.index_select(0, anchor_index), residuals, entry)  # float16 under autocast
         x = nn.functional.leaky_relu(first[:, : self.width], NEGATIVE_SLOPE)
         for block in self.blocks:
             x = block(x)
         return torch.addmm(first[:, self.width :], x, self.output_weight)
 
-    def arrays(self) -> "tuple[_A, ...]":
+    def arrays(self) -> "MLPArrays":
         """A, bias [H + O] of the anchor's part, then R, V1, a1, V2, a2, U of `residual_mlp`: copies, in float32."""
         anchor_entry, entry, bias = (t.detach() for t in self._entry())
         return anchor_entry.numpy(), bias.numpy(), *_arrays(tuple(self._after_entry(entry)))
@@ -89,6 +89,7 @@ class ResidualMLP(nn.Module):
 
 
 _A = np.ndarray
+MLPArrays = tuple[_A, _A, _A, _A, _A, _A, _A, _A]
 
 
 def _arrays(weights: tuple[Tensor, ...]) -> tuple[_A, _A, _A, _A, _A, _A]:

@@ -60,9 +60,7 @@ def draw(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> Rast
     return RasterResult(image, transmittance, means2d, torch.from_numpy(lists.visible))
 
 
-def blend(
-    lists: TileLists, camera: Camera, settings: RasterSettings
-) -> tuple[Tensor, Tensor, np.ndarray]:
+def blend(lists: TileLists, camera: Camera, settings: RasterSettings) -> tuple[Tensor, Tensor, np.ndarray]:
     """image [H, W, 3], transmittance [H, W], and per tile the entry after the last one needed."""
     image = torch.empty(camera.height, camera.width, 3)
     transmittance = torch.empty(camera.height, camera.width)
