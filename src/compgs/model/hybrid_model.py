@@ -110,14 +110,19 @@ class HybridModel:
             chosen = torch.arange(len(p), device=p.positions.device)
         else:
             chosen = torch.nonzero(visible).view(-1)
-        plain = p.residuals.dtype == self.appearance_dtype == torch.float32
-        if p.positions.device.type == "cpu" and plain and self.heads.layout == "paired":
+        if self._fused:
             return self._fused_gaussians(chosen, center)
         blocks = chosen.split(GPU_BLOCK if chosen.is_cuda else BLOCK)
         parts = [self._appearance(anchors, center) for anchors in blocks]
         drawn, opacities, colors = (torch.cat(part) for part in zip(*parts, strict=True))
         means, scales, quaternions = (array.index_select(0, drawn) for array in self.geometry)
         return Gaussians(means, quaternions, scales, opacities, colors)
+
+    @property
+    def _fused(self) -> bool:
+        """Whether the kernels of `appearance` do it."""
+        plain = self.primitives.residuals.dtype == self.appearance_dtype == torch.float32
+        return plain and self.primitives.residuals.device.type == "cpu" and self.heads.layout == "paired"
 
     @functools.cached_property
     def _appearance_arrays(self) -> MLPArrays:

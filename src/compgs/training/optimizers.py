@@ -103,8 +103,10 @@ def adam_rows(
     v = second.index_select(0, rows).mul_(beta2).addcmul_(g, g, value=1 - beta2)
     first.index_copy_(0, rows, m)
     second.index_copy_(0, rows, v)
-    denominator = (v / (1 - beta2**steps)).sqrt_().add_(group["eps"])
-    parameter.index_add_(0, rows, m / (1 - beta1**steps) / denominator, alpha=-group["lr"])
+    # expm1: 1 - 0.999^steps would lose digits in the first steps
+    correction1, correction2 = (-torch.expm1(steps * math.log(beta)) for beta in (beta1, beta2))
+    denominator = (v / correction2).sqrt_().add_(group["eps"])
+    parameter.index_add_(0, rows, m / correction1 / denominator, alpha=-group["lr"])
 
 
 @njit(parallel=True, fastmath={"contract", "nsz", "arcp"}, error_model="numpy", cache=True)
