@@ -118,9 +118,9 @@ def _adam_rows(rows, parameter, gradient, first, second, numbers):
             r = rows[i]
             p, g, m, v = parameter[r], gradient[r], first[r], second[r]
             for c in range(len(p)):
-                m[c] += new1 * (g[c] - m[c])
-                v[c] += new2 * (g[c] * g[c] - v[c])
-                p[c] -= rate * m[c] / (np.sqrt(v[c]) + epsilon)
+                mean, square = m[c] + new1 * (g[c] - m[c]), v[c] + new2 * (g[c] * g[c] - v[c])
+                m[c], v[c] = mean, square
+                p[c] -= rate * mean / (np.sqrt(square) + epsilon)
 
 
 @torch.no_grad()
