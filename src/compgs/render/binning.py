@@ -65,7 +65,7 @@ class PackedSplats:
     first_slot: np.ndarray  # [M] int32
     slots_used: np.ndarray  # [M] int32
     slots: np.ndarray  # [..] int32: tiles, splat by splat (with gaps)
-    rows: np.ndarray  # [..] int32: first and last row within the tile (first * 256 + last)
+    rows: np.ndarray  # [..] uint16: first and last row within the tile (first * 256 + last)
     counts: np.ndarray  # [CHUNKS, tiles] int64: slots of each chunk of splats, by tile
 
 
@@ -102,7 +102,8 @@ def pack_splats(
     m = len(means2d)
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     log2_cutoff = f32(math.log2(settings.alpha_cutoff))
-    visible, boxes = np.empty(m, np.bool_), np.empty((m, 4), np.int32)
+    pixel = np.uint16 if max(width, height) < 1 << 16 else np.int32  # memory: this is near its peak
+    visible, boxes = np.empty(m, np.bool_), np.empty((m, 4), pixel)
     packed = np.empty((m, PARAMETERS), np.float32)
     found, room = np.empty(CHUNKS, np.int64), np.empty(CHUNKS, np.int64)
     find_visible(
@@ -114,7 +115,7 @@ def pack_splats(
             f"rasterization: {found.sum()} visible Gaussians cover {room.sum()} tiles of the image, at most "
             f"{MOST_SLOTS} fit; are the scales in world units?"
         )
-    slots, rows = np.empty(room.sum(), np.int32), np.empty(room.sum(), np.int32)
+    slots, rows = np.empty(room.sum(), np.int32), np.empty(room.sum(), np.uint16)
     first_slot, slots_used = np.empty(m, np.int32), np.empty(m, np.int32)
     counts = np.empty((CHUNKS, tiles_x * tiles_y), np.int64)
     find_tiles(
@@ -236,7 +237,8 @@ def find_tiles(
             top_dx = b * np.sqrt(reach / c)  # where the ellipse is highest; lowest at -top_dx
             inv_a = ONE / a
             slope, spread, reach_a = b * inv_a, det * inv_a * inv_a, reach * a
-            x0, x1, y0, y1 = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
+            x0, x1 = np.int64(boxes[i, 0]), np.int64(boxes[i, 1])
+            y0, y1 = np.int64(boxes[i, 2]), np.int64(boxes[i, 3])
             first = slot
             for column in range(x0 >> TILE_X_BITS, (x1 >> TILE_X_BITS) + 1):
                 left = max(f32(column * TILE_WIDTH) + HALF - x, -half_x)
