@@ -33,7 +33,7 @@ PARTS = (
     ("culling", "compgs.render.render_model", "visible_mask"),
     ("networks", "compgs.model.hybrid_model", "predict_appearance"),
     ("gathering what is drawn", "compgs.model.hybrid_model", "gather_drawn"),
-    ("projection", "compgs.render.numba_backend", "project"),
+    ("projection", "compgs.render.numba_backend", "project_forward"),
     ("binning: tiles of each splat", "compgs.render.numba_backend", "pack_splats"),
     ("binning: lists of each tile", "compgs.render.numba_backend", "list_tiles"),
     ("blending", "compgs.render.numba_backend", "blend"),

@@ -97,14 +97,20 @@ def pack_splats(
     width: int,
     height: int,
     settings: RasterSettings,
+    packed: np.ndarray | None = None,  # [M, PARAMETERS] to be filled
 ) -> PackedSplats:
-    """Raises MemoryError for splats that would need absurd amounts of it."""
+    """Raises MemoryError for splats that would need absurd amounts of it.
+
+    Means, covariances and determinants may lie in columns 0, 1 and 2, 3, 4 and 6 of `packed` already: a splat's are
+    read before its row is written.
+    """
     m = len(means2d)
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     log2_cutoff = f32(math.log2(settings.alpha_cutoff))
     pixel = np.uint16 if max(width, height) < 1 << 16 else np.int32  # memory: this is near its peak
     visible, boxes = np.empty(m, np.bool_), np.empty((m, 4), pixel)
-    packed = np.empty((m, PARAMETERS), np.float32)
+    if packed is None:
+        packed = np.empty((m, PARAMETERS), np.float32)
     found, room = np.empty(CHUNKS, np.int64), np.empty(CHUNKS, np.int64)
     find_visible(
         means2d, covariances, depths, opacities, colors, log2_cutoff, width, height,

@@ -282,26 +282,6 @@ def project_backward(
             grad_scales[j, 2] = s[i + SZ]
 
 
-def project(
-    means: Tensor, quaternions: Tensor, scales: Tensor, numbers: np.ndarray
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """means2d [M, 2], covariances [M, 3] (xx, xy, yy), depths [M] (inf: not drawn), determinants [M]; pixels."""
-    m = len(means)
-    means2d, covariances = means.new_empty(m, 2), means.new_empty(m, 3)
-    depths, determinants = means.new_empty(m), means.new_empty(m)
-    project_forward(
-        as_array(means),
-        as_array(quaternions),
-        as_array(scales),
-        numbers,
-        as_array(means2d),
-        as_array(covariances),
-        as_array(depths),
-        as_array(determinants),
-    )
-    return means2d, covariances, depths, determinants
-
-
 class Project(torch.autograd.Function):
     """means2d [M, 2], covariances [M, 3] (xx, xy, yy); without gradient: depths [M], determinants [M]."""
 
@@ -309,7 +289,19 @@ class Project(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, numbers: np.ndarray
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        means2d, covariances, depths, determinants = project(means, quaternions, scales, numbers)
+        m = len(means)
+        means2d, covariances = means.new_empty(m, 2), means.new_empty(m, 3)
+        depths, determinants = means.new_empty(m), means.new_empty(m)
+        project_forward(
+            as_array(means),
+            as_array(quaternions),
+            as_array(scales),
+            numbers,
+            as_array(means2d),
+            as_array(covariances),
+            as_array(depths),
+            as_array(determinants),
+        )
         ctx.save_for_backward(means, quaternions, scales, depths)
         ctx.numbers = numbers
         ctx.mark_non_differentiable(depths, determinants)
