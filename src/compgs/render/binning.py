@@ -161,6 +161,12 @@ def tile_at(turn, tiles):
 
 
 @njit(inline="always")
+def signed(number):
+    """An unsigned number that may be mixed with signed ones: numba would make floats of them."""
+    return np.int64(number)
+
+
+@njit(inline="always")
 def pixel_interval(low, high, size):
     """First and last of `size` pixels whose centres lie in [low, high]."""
     first = max(np.ceil(low - HALF), ZERO)
@@ -243,8 +249,12 @@ def find_tiles(
             top_dx = b * np.sqrt(reach / c)  # where the ellipse is highest; lowest at -top_dx
             inv_a = ONE / a
             slope, spread, reach_a = b * inv_a, det * inv_a * inv_a, reach * a
-            x0, x1 = np.int64(boxes[i, 0]), np.int64(boxes[i, 1])
-            y0, y1 = np.int64(boxes[i, 2]), np.int64(boxes[i, 3])
+            x0, x1, y0, y1 = (
+                signed(boxes[i, 0]),
+                signed(boxes[i, 1]),
+                signed(boxes[i, 2]),
+                signed(boxes[i, 3]),
+            )
             first = slot
             for column in range(x0 >> TILE_X_BITS, (x1 >> TILE_X_BITS) + 1):
                 left = max(f32(column * TILE_WIDTH) + HALF - x, -half_x)

@@ -69,8 +69,8 @@ def draw(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> Rast
     lists = list_tiles(splats, depths)
     image, transmittance, _ = blend(lists, camera, settings)
     del splats, depths
-    means2d = torch.from_numpy(means2d.copy())
-    return RasterResult(image, transmittance, means2d, torch.from_numpy(lists.visible))
+    visible = torch.from_numpy(lists.visible)
+    return RasterResult(image, transmittance, torch.from_numpy(means2d.copy()), visible)
 
 
 def blend(lists: TileLists, camera: Camera, settings: RasterSettings) -> tuple[Tensor, Tensor, np.ndarray]:
