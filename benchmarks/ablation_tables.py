@@ -27,7 +27,7 @@ class Row:
     lpips: float | None
     bytes: float | None  # None: no file holds it
     anchors: float | None
-    coupled_primitives: float | None
+    primitives: float | None  # coupled primitives, or splats of 3DGS
     seconds: float
     components: dict[str, float]  # bytes
 
@@ -54,10 +54,10 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
                 psnr=fmean(psnr),
                 psnr_spread=_spread(psnr),
                 ssim=_mean(results, "ssim"),
-                lpips=None if any(r.get("lpips") is None for r in results) else _mean(results, "lpips"),
+                lpips=_mean_or_none(results, "lpips"),
                 bytes=_mean(results, "bytes"),
-                anchors=_mean(results, "anchors"),
-                coupled_primitives=_mean(results, "coupled_primitives"),
+                anchors=_mean_or_none(results, "anchors"),
+                primitives=_mean_or_none(results, "splats") or _mean_or_none(results, "coupled_primitives"),
                 seconds=_seconds(mine),
                 components={c: fmean(r["components"].get(c, 0) for r in results) for c in components},
             )
@@ -66,7 +66,11 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
 
 
 def _mean(results: Sequence[Record], key: str) -> float:
-    return fmean(result.get(key) or 0 for result in results)
+    return fmean(result[key] for result in results)
+
+
+def _mean_or_none(results: Sequence[Record], key: str) -> float | None:
+    return None if any(result.get(key) is None for result in results) else _mean(results, key)
 
 
 def _spread(values: Sequence[float]) -> float | None:
@@ -117,7 +121,7 @@ def table(rows: Sequence[Row]) -> str:
     for row in rows:
         spread = f" ± {row.psnr_spread:.2f}" if row.psnr_spread is not None else ""
         lpips = [] if not with_lpips else ["" if row.lpips is None else f"{row.lpips:.3f}"]
-        counts = [row.bytes, row.anchors, row.coupled_primitives]
+        counts = [row.bytes, row.anchors, row.primitives]
         cells = [row.label, f"{row.psnr:.2f}{spread}", f"{row.ssim:.4f}", *lpips]
         cells += ["none" if c is None else f"{c:,.0f}" for c in counts]
         lines.append("| " + " | ".join([*cells, f"{row.seconds:.0f}"]) + " |")
@@ -141,7 +145,7 @@ def bits_each(row: Row) -> tuple[float, float]:
     """Bits per anchor primitive and per coupled primitive, of their own components; networks belong to neither."""
     anchor = 8 * sum(row.components.get(name, 0) for name in ANCHOR_COMPONENTS)
     coupled = 8 * sum(row.components.get(name, 0) for name in COUPLED_COMPONENTS)
-    return anchor / max(row.anchors or 0, 1), coupled / max(row.coupled_primitives or 0, 1)
+    return anchor / max(row.anchors or 0, 1), coupled / max(row.primitives or 0, 1)
 
 
 def curves_of(rows: Sequence[Row]) -> dict[str, list[tuple[float, float]]]:

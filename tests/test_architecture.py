@@ -41,9 +41,11 @@ ALLOWED = {
     "metrics": BASE | {"ssim"},
     "trained_model": BASE | {"model", "entropy"},
     "codec": BASE | {"model", "entropy", "trained_model"},
+    "export": BASE | {"model"},
     "training": BASE | {"scene", "render", "model", "entropy", "ssim", "losses", "metrics", "trained_model"},
-    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec"},
-    "cli": BASE | {"scene", "render", "model", "metrics", "codec", "training", "evaluation", "trained_model"},
+    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "export"},
+    "cli": BASE
+    | {"scene", "render", "model", "metrics", "codec", "export", "training", "evaluation", "trained_model"},
     "__main__": BASE | {"cli"},
 }
 

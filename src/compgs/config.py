@@ -98,9 +98,42 @@ class TrainingConfig:
     quantized_weights: float = (
         0.8  # of the steps before the networks' weights are trained as they will be stored
     )
+    sparse_adam: bool = (
+        False  # Adam moves, and lets decay the moments of, only the anchors in view (Taming 3DGS)
+    )
+    appearance_dtype: Literal["float32", "bfloat16"] = (
+        "float32"  # in which the networks of opacity and color compute; bfloat16 is meant for GPUs
+    )
     checkpoint_minutes: float = (
         5.0  # between two checkpoints; one is also written when the run is interrupted
     )
+
+
+@dataclass(frozen=True)
+class SplatConfig:
+    """Plain 3D Gaussian Splatting (`--method 3dgs`; Kerbl et al. 2023), as published; schedules as fractions of its
+    30 000 steps, with floors in passes over the views (`training/densification.py`).
+    """
+
+    harmonics: int = 3  # degree of the spherical harmonics at the end
+    harmonics_every: float = 1 / 30  # of the steps between two degrees (1 000 of 30 000)
+    initial_opacity: float = 0.1  # of the splats that the points become
+    position_lr: tuple[float, float] = (1.6e-4, 1.6e-6)  # scene extents per step, first and last
+    color_lr: float = 2.5e-3  # of harmonic coefficients of degree 0
+    harmonics_lr: float = 1.25e-4  # of the degrees above: a twentieth
+    opacity_lr: float = 0.05  # of logits
+    log_scale_lr: float = 5e-3
+    rotation_lr: float = 1e-3  # of quaternions
+    densify_start: float = 1 / 60  # of the steps (500 of 30 000)
+    densify_stop: float = 0.5  # of the steps (15 000)
+    densify_every: float = 1 / 300  # of the steps (100), at least one pass over the views
+    gradient_threshold: float = 2e-4  # mean norm of the 2D gradient, in units of half the image
+    split_size: float = 0.01  # scene extents: larger splats are split, smaller ones cloned
+    prune_opacity: float = 0.005  # splats with less are removed
+    prune_size: float = 0.1  # scene extents: larger splats are removed once opacities have been reset
+    reset_every: float = 0.1  # of the steps (3 000) between two resets of the opacities
+    reset_opacity: float = 0.01  # what opacities are reset to, where they are above
+    max_splats: int = 6_000_000  # growth stops here; the largest published scenes have about as many
 
 
 @dataclass(frozen=True)
@@ -111,6 +144,7 @@ class Config:
     entropy: EntropyConfig = field(default_factory=EntropyConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
+    splats: SplatConfig = field(default_factory=SplatConfig)
 
     def to_dict(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
@@ -145,11 +179,12 @@ def load_config(preset: str = "default") -> Config:
 
 def check_config(config: Config) -> None:
     """Raises ConfigError for the first setting that is out of range."""
-    m, e, t, c = config.model, config.entropy, config.training, config.control
+    m, e, t, c, s = config.model, config.entropy, config.training, config.control, config.splats
     rules = [
         ("model.coupled_primitives", 1 <= m.coupled_primitives <= 64, "1 to 64"),
         ("model.reference_dim", 1 <= m.reference_dim <= 256, "1 to 256"),
         ("model.residual_dim", 1 <= m.residual_dim <= 64, "1 to 64"),
+        ("model.residuals", m.residuals or not t.sparse_adam, "true where training.sparse_adam is"),
         ("model.width", 8 <= m.width <= 256 and m.width % 8 == 0, "a multiple of 8 up to 256"),
         ("model.heads", m.heads in ("separate", "paired"), "separate or paired"),
         ("model.voxel_size", m.voxel_size is None or 0 < m.voxel_size < float("inf"), "above 0"),
@@ -173,6 +208,8 @@ def check_config(config: Config) -> None:
         ("training.scale_weight", 0 <= t.scale_weight < 1e6, "0 or more"),
         ("training.quantized_weights", 0 <= t.quantized_weights <= 1, "0 to 1"),
         ("training.head_warm_up", 0 <= t.head_warm_up <= 1, "0 to 1"),
+        ("training.sparse_adam", isinstance(t.sparse_adam, bool), "true or false"),
+        ("training.appearance_dtype", t.appearance_dtype in ("float32", "bfloat16"), "float32 or bfloat16"),
         ("training.checkpoint_minutes", 0 < t.checkpoint_minutes < 1e6, "above 0"),
         ("control.start", 0 <= c.start <= 1, "0 to 1"),
         ("control.stop", 0 <= c.stop <= 1, "0 to 1"),
@@ -181,7 +218,27 @@ def check_config(config: Config) -> None:
         ("control.minimum_views", 0 <= c.minimum_views < 1 << 31, "0 or more"),
         ("control.opacity_threshold", 0 <= c.opacity_threshold < 1e3, "0 or more"),
         ("control.growth_probability", 0 <= c.growth_probability <= 1, "0 to 1"),
+        ("splats.harmonics", 0 <= s.harmonics <= 3, "0 to 3"),
+        ("splats.harmonics_every", 0 <= s.harmonics_every <= 1, "0 to 1"),
+        ("splats.initial_opacity", 0 < s.initial_opacity < 1, "above 0, below 1"),
+        ("splats.densify_start", 0 <= s.densify_start <= 1, "0 to 1"),
+        ("splats.densify_stop", 0 <= s.densify_stop <= 1, "0 to 1"),
+        ("splats.densify_every", 0 < s.densify_every <= 1, "above 0, up to 1"),
+        ("splats.gradient_threshold", 0 < s.gradient_threshold < 1e6, "above 0"),
+        ("splats.split_size", 0 < s.split_size < 1e6, "above 0"),
+        ("splats.prune_opacity", 0 <= s.prune_opacity < 1, "0 or more, below 1"),
+        ("splats.prune_size", 0 < s.prune_size < 1e6, "above 0"),
+        ("splats.reset_every", 0 < s.reset_every <= 1, "above 0, up to 1"),
+        ("splats.reset_opacity", s.prune_opacity < s.reset_opacity < 1, "above prune_opacity, below 1"),
+        ("splats.max_splats", 1 <= s.max_splats <= 1 << 26, "1 to 67108864"),
+        (
+            "splats.position_lr",
+            len(s.position_lr) == 2 and all(0 < r < 100 for r in s.position_lr),
+            "two learning rates above 0, first and last",
+        ),
     ]
+    for name in ("color_lr", "harmonics_lr", "opacity_lr", "log_scale_lr", "rotation_lr"):
+        rules.append((f"splats.{name}", 0 < getattr(s, name) < 100, "a learning rate above 0"))
     for name, rates in dataclasses.asdict(t).items():
         if name.endswith("_lr"):
             good = len(rates) == 2 and all(0 < rate < 100 for rate in rates)

@@ -11,6 +11,7 @@ CompGSError
 ├── OutputError                 the place to write to: exists, full, not writable
 ├── CheckpointError             a run that cannot be continued
 ├── TrainingError               a training that cannot go on (no visible primitives, not-a-number loss)
+├── SplatFileError              a .ply file that does not hold splats, or not whole ones
 └── BitstreamError              the .cgs file
     ├── NotACompGSFile
     ├── UnsupportedVersion
@@ -61,6 +62,10 @@ class CheckpointError(CompGSError):
 
 class TrainingError(CompGSError):
     """The optimization cannot go on."""
+
+
+class SplatFileError(CompGSError):
+    """The .ply file is damaged, or not of the layout of 3DGS."""
 
 
 class BitstreamError(CompGSError):

@@ -36,7 +36,8 @@ class Status:
     steps: int = 100
     loss: float = 0.05
     psnr: float = 27.94
-    anchors: int = 4211
+    primitives: int = 4211
+    kind: str = "anchors"
     estimated_bytes: int = 181_000
     seconds_per_step: float = 0.08
     lmbda: float = 0.001

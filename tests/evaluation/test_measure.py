@@ -54,8 +54,9 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def render(model: StandIn, camera: Camera) -> SimpleNamespace:
         return SimpleNamespace(image=torch.full((camera.height, camera.width, 3), model.level))
 
-    monkeypatch.setattr(f"{module}.decode", lambda path, device: StandIn(100 / 255))
-    monkeypatch.setattr(f"{module}.file_info", lambda data: SimpleNamespace(sections=sections))
+    files = "compgs.evaluation.scene_file"
+    monkeypatch.setattr(f"{files}.decode", lambda path, device: StandIn(100 / 255))
+    monkeypatch.setattr(f"{files}.file_info", lambda data: SimpleNamespace(sections=sections))
     monkeypatch.setattr(f"{module}.render", render)
     return path
 

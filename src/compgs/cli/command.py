@@ -55,6 +55,14 @@ class FileArgument:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SceneFileArgument:
+    """Which file, of those that hold a scene."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The .cgs file, or a .ply file of splats as 3DGS writes it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReadingOptions:
     """How a scene is read."""
 

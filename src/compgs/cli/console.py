@@ -42,16 +42,21 @@ def duration(seconds: float) -> str:
 
 
 def print_components(components: Mapping[str, int], anchors: int, coupled: int) -> None:
-    """Bytes and bits by component of a file."""
+    """Bytes and bits by component of a .cgs file."""
+    _print_shares(components, {"bits/anchor": anchors, "bits/coupled": coupled})
+
+
+def _print_shares(components: Mapping[str, int], counts: Mapping[str, int]) -> None:
+    """Bytes by component, and bits by heading: of what there are so many in the file."""
     total = sum(components.values())
     table = Table(box=None, pad_edge=False)
-    for heading in ("component", "bytes", "share", "bits/anchor", "bits/coupled"):
+    for heading in ("component", "bytes", "share", *counts):
         table.add_column(heading, justify="left" if heading == "component" else "right")
     for name, count in [*components.items(), ("total", total)]:
         share = f"{100 * count / max(total, 1):.1f} %"
-        per_anchor, per_coupled = 8 * count / max(anchors, 1), 8 * count / max(coupled, 1)
+        bits = [f"{8 * count / max(each, 1):.2f}" for each in counts.values()]
         style = "bold" if name == "total" else None
-        table.add_row(name, f"{count:,}", share, f"{per_anchor:.2f}", f"{per_coupled:.2f}", style=style)
+        table.add_row(name, f"{count:,}", share, *bits, style=style)
     console.print(table)
 
 
@@ -80,16 +85,24 @@ def print_results(results: "Results") -> None:
     elif results.lpips_note != "not asked for":
         table.add_row("LPIPS", escape(str(results.lpips_note)))
     table.add_row("file", f"{results.bytes:,} bytes")
-    table.add_row("anchors", f"{results.anchors:,}")
-    table.add_row("coupled primitives", f"{results.coupled_primitives:,}")
-    table.add_row("bits per anchor", f"{results.bits_per_anchor:.1f}")
+    if results.splats is not None:
+        table.add_row("splats", f"{results.splats:,}")
+    if results.anchors is not None:
+        table.add_row("anchors", f"{results.anchors:,}")
+        table.add_row("coupled primitives", f"{results.coupled_primitives:,}")
+        table.add_row("bits per anchor", f"{results.bits_per_anchor:.1f}")
     table.add_row("decoding", duration(results.decode_seconds))
     table.add_row("rendering a view", duration(results.render_seconds))
     views = f"{len(results.per_view)} held-out views, {results.width} x {results.height}"
     say(f"{results.file} on {results.scene}: {views}, {results.device}, {results.threads} threads")
     console.print(table)
     console.print()
-    print_components(results.components, results.anchors, results.coupled_primitives)
+    counts = {
+        "bits/anchor": results.anchors,
+        "bits/coupled": results.coupled_primitives,
+        "bits/splat": results.splats,
+    }
+    _print_shares(results.components, {name: n for name, n in counts.items() if n is not None})
 
 
 def print_reduction(reduction: "Reduction") -> None:

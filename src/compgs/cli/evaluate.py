@@ -6,17 +6,17 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument, SceneOptions
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions
 from compgs.cli.console import print_results, say
-from compgs.cli.inputs import check_bitstream
+from compgs.cli.inputs import check_scene_file
 from compgs.cli.progress import counting
 from compgs.cli.scenes import read_scene
 from compgs.outputs import check_output_folder
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(ComputingCommand, SceneOptions, FileArgument):
-    """Decode a .cgs file, render the held-out views of a scene from it and compare them with the photographs.
+class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
+    """Decode a .cgs or .ply file, render a scene's held-out views from it and compare them with the photographs.
 
     Give -r, --images, --test-every and --background as in training: the views held out there are the ones to
     evaluate on.
@@ -26,6 +26,8 @@ class Evaluate(ComputingCommand, SceneOptions, FileArgument):
     compgs evaluate garden.cgs scenes/garden
 
     compgs evaluate garden.cgs scenes/garden -r 4 -o garden-evaluation
+
+    compgs evaluate garden.ply scenes/garden
     """
 
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="FOLDER", help_behavior_hint=NO_DEFAULT)] = (
@@ -40,7 +42,7 @@ class Evaluate(ComputingCommand, SceneOptions, FileArgument):
     """Also measure LPIPS (needs `pip install 'compgs[lpips]'`)."""
 
     def run(self) -> None:
-        check_bitstream(self.file)
+        check_scene_file(self.file)
         if self.output is not None:
             check_output_folder(self.output, overwrite=self.overwrite)
         source = self.scene_source()

@@ -16,6 +16,16 @@ def check_bitstream(path: Path) -> None:
         raise type(error)(f"{path}: {error}") from error
 
 
+def check_scene_file(path: Path) -> None:
+    """Of a .cgs file, or a .ply file of splats: as `check_bitstream`. Raises BitstreamError, SplatFileError."""
+    if path.suffix.lower() == ".ply":
+        from compgs.export.ply import read_ply_header
+
+        read_ply_header(path)
+    else:
+        check_bitstream(path)
+
+
 def read_bitstream(path: Path) -> bytes:
     """The bytes of a file. Raises NotACompGSFile."""
     if path.is_dir():

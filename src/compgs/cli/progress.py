@@ -36,7 +36,7 @@ def counting(what: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def training() -> Iterator[Callable[["TrainingStatus"], None]]:
-    """Yields `on_progress(status)`: rate, loss, quality, anchors, estimated size and time left."""
+    """Yields `on_progress(status)`: rate, loss, quality, primitives, estimated size and time left."""
     if not console.is_terminal:
         yield _training_lines()
         return
@@ -68,9 +68,10 @@ def training() -> Iterator[Callable[["TrainingStatus"], None]]:
 def describe(status: "TrainingStatus") -> str:
     """`12.3 steps/s  loss 0.0512  PSNR 27.9 dB  4,211 anchors  ~181.0 kB  lambda 0.001`."""
     rate = 1 / status.seconds_per_step if status.seconds_per_step > 0 else 0.0
+    rate_weight = f"  lambda {status.lmbda:.2g}" if status.lmbda is not None else ""
     return (
-        f"{rate:.1f} steps/s  loss {status.loss:.4f}  PSNR {status.psnr:.1f} dB  {status.anchors:,} anchors  "
-        f"~{size(status.estimated_bytes)}  lambda {status.lmbda:.2g}"
+        f"{rate:.1f} steps/s  loss {status.loss:.4f}  PSNR {status.psnr:.1f} dB  {status.primitives:,} {status.kind}  "
+        f"~{size(status.estimated_bytes)}{rate_weight}"
     )
 
 

@@ -8,21 +8,24 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument, SceneOptions, UsageError
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions, UsageError
 from compgs.cli.console import duration, say
-from compgs.cli.inputs import check_bitstream
+from compgs.cli.inputs import check_scene_file
 from compgs.cli.progress import counting
 from compgs.cli.scenes import read_scene
 from compgs.outputs import check_output_folder, write_bytes, write_json
 
 if TYPE_CHECKING:
     from compgs.cameras import Camera
-    from compgs.model.hybrid_model import HybridModel
+    from compgs.evaluation.scene_file import SceneModel
+    from compgs.scene import Scene
+
+BLACK = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(ComputingCommand, SceneOptions, FileArgument):
-    """Render images from a .cgs file: views of a scene, cameras of a JSON file, or a circle around the scene.
+class Render(ComputingCommand, SceneOptions, SceneFileArgument):
+    """Render images from a .cgs or .ply file: views of a scene, cameras of a JSON file, or a circle around the scene.
 
     A camera file is a list of objects with world_to_camera (4 x 4, OpenCV axes), fx, fy, cx, cy, width and
     height; training and evaluation leave one, cameras.json. Images are 00000.png, 00001.png, ...; the
@@ -68,7 +71,7 @@ class Render(ComputingCommand, SceneOptions, FileArgument):
     """Replace images that are in FOLDER already."""
 
     def run(self) -> None:
-        check_bitstream(self.file)
+        check_scene_file(self.file)
         check_output_folder(self.output, overwrite=self.overwrite)
         if self.cameras is not None and (self.scene or self.source):
             raise UsageError("both a scene and --cameras were given; give one")
@@ -82,21 +85,24 @@ class Render(ComputingCommand, SceneOptions, FileArgument):
         self.prepare()
         import torch
 
-        from compgs.codec import decode
+        from compgs.evaluation.scene_file import open_scene_file
 
-        views = self.given_views()
-        model = decode(self.file, self.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        scene = read_scene(self.scene_source()) if self.scene or self.source else None
+        views = self.given_views(scene)
+        # Of .ply files alone: a .cgs file has its own.
+        background = scene.background if scene else self.background or BLACK
+        device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
+        model = open_scene_file(self.file, device, background)
         self.render(model, views or self.circle(model))
 
-    def given_views(self) -> "Sequence[tuple[str, Camera]]":
+    def given_views(self, scene: "Scene | None") -> "Sequence[tuple[str, Camera]]":
         """Names and cameras of the scene or camera file; none if neither was given."""
         if self.cameras is not None:
             from compgs.evaluation.camera_path import read_cameras
 
             return read_cameras(self.cameras)
-        if self.scene is None and self.source is None:
+        if scene is None:
             return []
-        scene = read_scene(self.scene_source())
         chosen = {
             "test": scene.test_views,
             "train": scene.train_views,
@@ -106,11 +112,11 @@ class Render(ComputingCommand, SceneOptions, FileArgument):
             raise UsageError(f"--split {self.split}: the scene has no such views")
         return [(view.name, view.camera) for view in chosen]
 
-    def circle(self, model: "HybridModel") -> "Sequence[tuple[str, Camera]]":
+    def circle(self, model: "SceneModel") -> "Sequence[tuple[str, Camera]]":
         from compgs.evaluation.camera_path import orbit
 
         return orbit(
-            model.primitives.positions.cpu().numpy(),
+            model.bounds[0].cpu().numpy(),
             frames=self.frames,
             width=self.width,
             height=self.height,
@@ -119,7 +125,7 @@ class Render(ComputingCommand, SceneOptions, FileArgument):
             distance=self.distance,
         )
 
-    def render(self, model: "HybridModel", views: "Sequence[tuple[str, Camera]]") -> None:
+    def render(self, model: "SceneModel", views: "Sequence[tuple[str, Camera]]") -> None:
         from compgs.evaluation.camera_path import camera_entry
         from compgs.evaluation.measure import encode_png, timed_render
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from compgs import __version__
+from compgs.cli.methods import METHODS
 from compgs.config import Config, config_from_dict
 from compgs.errors import CheckpointError
 from compgs.outputs import write_json
@@ -34,17 +35,19 @@ class RunSettings:
     preset: str
     scene: SceneSource
     config: Config
+    method: str = "compgs"
 
 
-def file_name(folder: Path) -> str:
-    """The `.cgs` file of a run is named after its folder."""
-    return f"{folder.absolute().name}.cgs"
+def file_name(folder: Path, extension: str = ".cgs") -> str:
+    """The file of a run is named after its folder."""
+    return f"{folder.absolute().name}{extension}"
 
 
 def save_settings(folder: Path, settings: RunSettings) -> None:
     """Raises OutputError."""
     content = {
         "compgs": __version__,
+        "method": settings.method,
         "preset": settings.preset,
         "scene": asdict(settings.scene),
         "settings": settings.config.to_dict(),
@@ -61,6 +64,7 @@ def load_settings(folder: Path) -> RunSettings:
             preset=str(content["preset"]),
             scene=_scene_source(content["scene"]),
             config=config_from_dict(content["settings"], str(path)),
+            method=_known_method(content.get("method", "compgs")),
         )
     except FileNotFoundError as error:
         raise CheckpointError(
@@ -70,6 +74,12 @@ def load_settings(folder: Path) -> RunSettings:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path}: not the settings of a run ({error}); train anew") from error
+
+
+def _known_method(name: str) -> str:
+    if name not in METHODS:
+        raise ValueError(f"method {name!r} is not one of {', '.join(METHODS)}")
+    return name
 
 
 def _scene_source(values: dict[str, Any]) -> SceneSource:

@@ -5,12 +5,13 @@ import shlex
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
 from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, UsageError, one_scene
 from compgs.cli.console import duration, print_profile, print_results, say, size
+from compgs.cli.methods import METHODS, check_settings_of
 from compgs.cli.progress import counting, training
 from compgs.cli.run_folder import (
     CHECKPOINT_NAME,
@@ -29,7 +30,6 @@ from compgs.outputs import check_output_folder, write_json
 
 if TYPE_CHECKING:
     from compgs.scene import Scene
-    from compgs.trained_model import TrainedModel
     from compgs.training import TrainingStatus
 
 NEEDED_BYTES = (
@@ -40,7 +40,10 @@ NOTABLE_MISS = 0.05  # of the size that was asked for
 
 @dataclass(frozen=True, kw_only=True)
 class Train(ComputingCommand, SceneOptions):
-    """Train a scene, write its .cgs file, decode the file and compare it with the held-out views.
+    """Train a scene, write its file, decode the file and compare it with the held-out views.
+
+    The file is a .cgs. With --method 3dgs the scene is trained by plain 3D Gaussian Splatting instead, without any
+    compression, and the file is a .ply: what compression is to be compared with.
 
     The run's folder then holds the file, results.json, per_view.json, config.json, the renders beside the
     photographs (test/renders, test/gt, contact_sheet.png) and a checkpoint.
@@ -57,6 +60,8 @@ class Train(ComputingCommand, SceneOptions):
 
     compgs train scenes/garden -o runs/two --target-size 2MB
 
+    compgs train scenes/garden -o runs/garden-3dgs --method 3dgs
+
     compgs train -o runs/garden --resume
     """
 
@@ -68,6 +73,9 @@ class Train(ComputingCommand, SceneOptions):
 
     eval: bool = True
     """Hold views out and evaluate on them; --no-eval trains on every view."""
+
+    method: Annotated[Literal["compgs", "3dgs"] | None, arg(help_behavior_hint="(default: compgs)")] = None
+    """compgs: hybrid primitives, rate and distortion. 3dgs: plain 3D Gaussian Splatting."""
 
     preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: default)")] = None
     """Settings to start from: default, paper (as published) or quick (minutes on two cores)."""
@@ -88,7 +96,7 @@ class Train(ComputingCommand, SceneOptions):
     """Of every random choice: the same seed on the same CPU gives the same file."""
 
     set: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="SECTION.KEY=VALUE")] = ()
-    """Any other setting of the run; sections: model, entropy, control, training."""
+    """Any other setting of the run; sections: model, entropy, control, training; of 3dgs: splats, training."""
 
     resume: FlagCreatePairsOff[bool] = False
     """Continue the run in RUN from its last checkpoint, with the settings it began with."""
@@ -118,16 +126,22 @@ class Train(ComputingCommand, SceneOptions):
             forget_earlier_run(folder)
             save_settings(folder, settings)
         model = self.train(scene, settings, folder)
-        self.encode_and_evaluate(scene, model, folder)
+        path = folder / file_name(folder, METHODS[settings.method].extension)
+        start = time.perf_counter()
+        written = METHODS[settings.method].write(model, path)
+        say(f"{path}: {size(written)}, written in {duration(time.perf_counter() - start)}")
+        self.evaluate(scene, path, folder)
         if settings.config.training.target_bytes is not None:
             say_miss(folder, settings.config.training.target_bytes)
 
     def settings(self, folder: Path) -> RunSettings:
         """From the command line, or of the run to be continued. Raises ConfigError, CheckpointError."""
         if not self.resume:
-            preset = self.preset or "default"
+            preset, method = self.preset or "default", self.method or "compgs"
             source = self.scene_source(holdout=self.eval)
-            return RunSettings(preset, source, with_settings(load_config(preset), self.assignments()))
+            check_settings_of(method, self.assignments())
+            config = with_settings(load_config(preset), self.assignments())
+            return RunSettings(preset, source, config, method)
         begun = load_settings(folder)
         if not (folder / CHECKPOINT_NAME).is_file():
             raise CheckpointError(
@@ -136,6 +150,8 @@ class Train(ComputingCommand, SceneOptions):
         if self.scene or self.source:
             # The data may have moved; whether it is the same scene, the checkpoint knows.
             begun = replace(begun, scene=replace(begun.scene, path=str(one_scene(self.scene, self.source))))
+        if self.method not in (None, begun.method):
+            raise ConfigError(f"--method {self.method}: the run to continue began with {begun.method}")
         if self.preset not in (None, begun.preset):
             raise ConfigError(f"--preset {self.preset}: the run to continue began with preset {begun.preset}")
         changed = with_settings(begun.config, self.assignments())
@@ -155,9 +171,9 @@ class Train(ComputingCommand, SceneOptions):
         }
         return (*(f"{name}={value}" for name, value in named.items() if value is not None), *self.set)
 
-    def train(self, scene: "Scene", settings: RunSettings, folder: Path) -> "TrainedModel":
-        """Raises KeyboardInterrupt, with what to do next, when the user stops it."""
-        from compgs.training import StepProfile, train
+    def train(self, scene: "Scene", settings: RunSettings, folder: Path) -> Any:
+        """The method's model. Raises KeyboardInterrupt, with what to do next, when the user stops it."""
+        from compgs.training import StepProfile
 
         profile = StepProfile() if self.profile else None
         last: TrainingStatus | None = None
@@ -170,7 +186,7 @@ class Train(ComputingCommand, SceneOptions):
                     last = status
                     show(status)
 
-                model = train(
+                model = METHODS[settings.method].train(
                     scene,
                     settings.config,
                     output=folder,
@@ -187,9 +203,9 @@ class Train(ComputingCommand, SceneOptions):
                 folder / TRAINING_NAME,
                 {
                     "steps": last.steps,
-                    "anchors": last.anchors,
+                    last.kind: last.primitives,
                     "estimated_bytes": last.estimated_bytes,
-                    "lmbda": last.lmbda,
+                    **({"lmbda": last.lmbda} if last.lmbda is not None else {}),
                     "seconds": seconds,
                     "seconds_per_step": last.seconds_per_step,
                     "resumed": self.resume,
@@ -201,12 +217,7 @@ class Train(ComputingCommand, SceneOptions):
             print_profile(profile.milliseconds())
         return model
 
-    def encode_and_evaluate(self, scene: "Scene", model: "TrainedModel", folder: Path) -> None:
-        from compgs.codec import encode
-
-        start = time.perf_counter()
-        encoded = encode(model, folder / file_name(folder), overwrite=True)
-        say(f"{encoded.path}: {size(encoded.bytes)}, encoded in {duration(time.perf_counter() - start)}")
+    def evaluate(self, scene: "Scene", file: Path, folder: Path) -> None:
         if not scene.test_views:
             say("no views are held out (--no-eval): the file was not evaluated")
             return
@@ -214,7 +225,7 @@ class Train(ComputingCommand, SceneOptions):
 
         with counting("evaluating views") as progress:
             results = evaluate(
-                encoded.path,
+                file,
                 scene,
                 output=folder,
                 overwrite=True,
@@ -249,7 +260,7 @@ def say_miss(folder: Path, target: int) -> None:
 def forget_earlier_run(folder: Path) -> None:
     """Remove what would be taken for the new run's, were the new run to stop early."""
     stale = [folder / name for name in (CHECKPOINT_NAME, TRAINING_NAME, "results.json", "per_view.json")]
-    for path in [*stale, folder / file_name(folder)]:
+    for path in [*stale, *(folder / file_name(folder, m.extension) for m in METHODS.values())]:
         try:
             path.unlink(missing_ok=True)
         except OSError as error:

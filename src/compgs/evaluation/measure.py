@@ -1,4 +1,4 @@
-"""Rate and distortion of a file, measured on what is decoded from it, never on a trained model."""
+"""Rate and distortion of a file, measured on what is read from it, never on a trained model."""
 
 import hashlib
 import io
@@ -13,13 +13,12 @@ from PIL import Image
 
 from compgs import __version__, metrics
 from compgs.cameras import Camera
-from compgs.codec.decoder import decode
-from compgs.codec.reader import file_info
 from compgs.errors import SceneError
 from compgs.evaluation.camera_path import camera_entry
 from compgs.evaluation.contact_sheet import contact_sheet
 from compgs.evaluation.results import Results, ViewResult
-from compgs.model.hybrid_model import HybridModel
+from compgs.evaluation.scene_file import SceneModel, component_bytes, open_scene_file
+from compgs.model.splats import SplatModel
 from compgs.outputs import check_output_folder, write_bytes, write_json
 from compgs.render import render
 from compgs.scene.views import Scene, View
@@ -37,14 +36,14 @@ def evaluate(
     device: str | torch.device | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Results:
-    """Decode a .cgs file and compare its renderings with the held-out views of a scene.
+    """Decode a .cgs file, or read a .ply file of splats, and compare its renderings with a scene's held-out views.
 
     Metrics are of 8-bit images (`compgs.metrics`). With `output`, a folder, `results.json` and
     `per_view.json` (their schema: `compgs.evaluation.results`), `cameras.json` (of the held-out views),
     `test/renders`, `test/gt` and `contact_sheet.png` are written there. `progress(done, total)` is called
     after each view.
 
-    Raises BitstreamError, SceneError if the scene holds no view out, OutputError.
+    Raises BitstreamError, SplatFileError, SceneError if the scene holds no view out, OutputError.
     """
     path = Path(file)
     if output is not None:
@@ -54,8 +53,8 @@ def evaluate(
             f"{scene.name}: no view is held out, so there is nothing to evaluate on; load with hold-out"
         )
     chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    model, first_seconds = _timed_decode(path, chosen)
-    model, decode_seconds = _timed_decode(path, chosen)
+    model, first_seconds = _timed_decode(path, chosen, scene.background)
+    model, decode_seconds = _timed_decode(path, chosen, scene.background)
 
     timed_render(
         model, scene.test_views[0].camera
@@ -93,9 +92,8 @@ def evaluate(
         width=scene.test_views[0].camera.width,
         height=scene.test_views[0].camera.height,
         bytes=len(data),
-        components=component_bytes(data),
-        anchors=model.anchors,
-        coupled_primitives=model.coupled,
+        components=component_bytes(path),
+        **_counts(model),
         first_decode_seconds=first_seconds,
         decode_seconds=decode_seconds,
         device=device_name(chosen),
@@ -109,16 +107,11 @@ def evaluate(
     return results
 
 
-def timed_render(model: HybridModel, camera: Camera) -> tuple[np.ndarray, float]:
+def timed_render(model: SceneModel, camera: Camera) -> tuple[np.ndarray, float]:
     """[H, W, 3] uint8, and the seconds it took until the image was there."""
     start = time.perf_counter()
     image = metrics.to_8bit(render(model, camera).image)
     return image, time.perf_counter() - start
-
-
-def component_bytes(data: bytes) -> dict[str, int]:
-    """Bytes of each component of a file; they sum to its size."""
-    return {section.name: section.bytes for section in file_info(data).sections}
 
 
 def device_name(device: torch.device) -> str:
@@ -157,7 +150,16 @@ def encode_png(image: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def _timed_decode(path: Path, device: torch.device) -> tuple[HybridModel, float]:
+def _timed_decode(
+    path: Path, device: torch.device, background: tuple[float, float, float]
+) -> tuple[SceneModel, float]:
     start = time.perf_counter()
-    model = decode(path, device)
+    model = open_scene_file(path, device, background)
     return model, time.perf_counter() - start
+
+
+def _counts(model: SceneModel) -> dict[str, int | None]:
+    """Of the primitives of either kind of scene; the other kind's are None."""
+    if isinstance(model, SplatModel):
+        return {"anchors": None, "coupled_primitives": None, "splats": len(model.splats)}
+    return {"anchors": model.anchors, "coupled_primitives": model.coupled, "splats": None}

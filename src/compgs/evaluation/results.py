@@ -13,8 +13,8 @@
 | lpips | mean over the views, or null; `lpips_note` then says why |
 | bytes | of the whole file |
 | components | bytes by component of the file; they sum to `bytes` |
-| anchors, coupled_primitives | counts |
-| bits_per_anchor, bits_per_coupled_primitive | all bits of the file by each count |
+| anchors, coupled_primitives, splats | counts; null what the file does not have: splats are of .ply files |
+| bits_per_anchor, bits_per_coupled_primitive, bits_per_splat | all bits of the file by each count, or null |
 | first_decode_seconds, decode_seconds | file to model: first in a process (loads kernels); again |
 | render_seconds | median over the views, after one view to warm up |
 | device, threads | where it ran |
@@ -55,8 +55,9 @@ class Results:
     height: int  # pixels
     bytes: int
     components: dict[str, int]  # bytes
-    anchors: int
-    coupled_primitives: int
+    anchors: int | None
+    coupled_primitives: int | None
+    splats: int | None
     first_decode_seconds: float
     decode_seconds: float
     device: str
@@ -84,12 +85,19 @@ class Results:
         return median(view.render_seconds for view in self.per_view)
 
     @property
-    def bits_per_anchor(self) -> float:
-        return 8 * self.bytes / self.anchors
+    def bits_per_anchor(self) -> float | None:
+        return self._bits_per(self.anchors)
 
     @property
-    def bits_per_coupled_primitive(self) -> float:
-        return 8 * self.bytes / self.coupled_primitives
+    def bits_per_coupled_primitive(self) -> float | None:
+        return self._bits_per(self.coupled_primitives)
+
+    @property
+    def bits_per_splat(self) -> float | None:
+        return self._bits_per(self.splats)
+
+    def _bits_per(self, count: int | None) -> float | None:
+        return None if count is None else 8 * self.bytes / count
 
     def to_dict(self) -> dict[str, Any]:
         """The content of `results.json`."""
@@ -109,8 +117,10 @@ class Results:
             "components": self.components,
             "anchors": self.anchors,
             "coupled_primitives": self.coupled_primitives,
+            "splats": self.splats,
             "bits_per_anchor": self.bits_per_anchor,
             "bits_per_coupled_primitive": self.bits_per_coupled_primitive,
+            "bits_per_splat": self.bits_per_splat,
             "first_decode_seconds": self.first_decode_seconds,
             "decode_seconds": self.decode_seconds,
             "render_seconds": self.render_seconds,

@@ -1,7 +1,9 @@
-"""Training: the loop, adaptive control, optimizer, checkpoints (CompGS Sec. 3.4)."""
+"""Training: the loop, adaptive control, optimizer, checkpoints (CompGS Sec. 3.4); plain 3DGS to compare with."""
 
+from compgs.training.loop import TrainingStatus
 from compgs.training.profile import StepProfile
 from compgs.training.run import load_run
-from compgs.training.trainer import Trainer, TrainingStatus, train
+from compgs.training.splat_trainer import SplatTrainer, train_splats
+from compgs.training.trainer import Trainer, train
 
-__all__ = ["StepProfile", "Trainer", "TrainingStatus", "load_run", "train"]
+__all__ = ["SplatTrainer", "StepProfile", "Trainer", "TrainingStatus", "load_run", "train", "train_splats"]

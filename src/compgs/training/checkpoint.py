@@ -12,10 +12,11 @@ from typing import Any
 import safetensors
 import safetensors.torch
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from compgs.config import config_from_dict
+from compgs.config import Config, config_from_dict
 from compgs.errors import CheckpointError, OutputError
+from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
@@ -39,8 +40,6 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     tensors |= {f"optimizer/{k}": v for k, v in checkpoint.optimizer.items()}
     tensors |= {f"extra/{k}": v for k, v in checkpoint.extra.items()}
     metadata = {
-        "format": "compgs checkpoint",
-        "version": CHECKPOINT_VERSION,
         "config": json.dumps(model.config.to_dict()),
         "scene": json.dumps(
             {
@@ -51,11 +50,21 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         ),
         "state": json.dumps(checkpoint.state),
     }
+    write_checkpoint_file(path, "compgs", tensors, metadata)
+
+
+def write_checkpoint_file(
+    path: Path, method: str, tensors: dict[str, Tensor], metadata: dict[str, str]
+) -> None:
+    """Tensors by name and JSON texts by name, of a method's run. Raises OutputError; see `save_checkpoint`."""
+    stamp = {"format": "compgs checkpoint", "version": CHECKPOINT_VERSION, "method": method}
     temporary = path.with_name(path.name + ".partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         safetensors.torch.save_file(
-            {k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary, metadata=metadata
+            {k: v.detach().cpu().contiguous() for k, v in tensors.items()},
+            temporary,
+            metadata=metadata | stamp,
         )
         os.replace(temporary, path)
     except (OSError, safetensors.SafetensorError) as error:
@@ -64,23 +73,11 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Raises CheckpointError if there is none, or it is damaged or of another version."""
-    if not path.is_file():
-        raise CheckpointError(f"{path}: there is no checkpoint; start the run without resuming")
-    try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, safetensors.SafetensorError) as error:
-        raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
-    if metadata.get("format") != "compgs checkpoint" or metadata.get("version") != CHECKPOINT_VERSION:
-        raise CheckpointError(f"{path}: not a checkpoint of this version ({CHECKPOINT_VERSION}); train anew")
+    """Raises CheckpointError if there is none, or it is damaged, of another version or of another method."""
+    tensors, metadata = read_checkpoint_file(path, "compgs")
     config = config_from_dict(json.loads(metadata["config"]), str(path))
     scene = json.loads(metadata["scene"])
-    parts: dict[str, dict[str, Tensor]] = {"model": {}, "optimizer": {}, "extra": {}}
-    for name, value in tensors.items():
-        kind, rest = name.split("/", 1)
-        parts[kind][rest] = value
+    parts = tensors_by_kind(tensors)
     model = TrainedModel(
         config,
         parts["model"]["coordinates"],
@@ -92,7 +89,49 @@ def load_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(model, parts["optimizer"], parts["extra"], json.loads(metadata["state"]))
 
 
-def optimizer_tensors(model: TrainedModel, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+def read_checkpoint_file(path: Path, method: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Inverse of `write_checkpoint_file`. Raises CheckpointError, as `load_checkpoint`."""
+    if not path.is_file():
+        raise CheckpointError(f"{path}: there is no checkpoint; start the run without resuming")
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, safetensors.SafetensorError) as error:
+        raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
+    if metadata.get("format") != "compgs checkpoint" or metadata.get("version") != CHECKPOINT_VERSION:
+        raise CheckpointError(f"{path}: not a checkpoint of this version ({CHECKPOINT_VERSION}); train anew")
+    found = metadata.get("method", "compgs")
+    if found != method:
+        raise CheckpointError(f"{path}: a run of method {found}, expected one of method {method}")
+    return tensors, metadata
+
+
+def tensors_by_kind(tensors: dict[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+    """`model/...`, `optimizer/...` and `extra/...`, each without the first part of the name."""
+    parts: dict[str, dict[str, Tensor]] = {"model": {}, "optimizer": {}, "extra": {}}
+    for name, value in tensors.items():
+        kind, rest = name.split("/", 1)
+        parts[kind][rest] = value
+    return parts
+
+
+def check_same_run(saved: Config, config: Config, saved_views: list[str], scene: Scene) -> None:
+    """Raises CheckpointError, naming what differs, if a checkpoint is of other settings or another scene."""
+    if saved != config:
+        now = config.to_dict()
+        differing = [
+            f"{section}.{key}: {value!r} then, {now[section][key]!r} now"
+            for section, values in saved.to_dict().items()
+            for key, value in values.items()
+            if now[section][key] != value
+        ]
+        raise CheckpointError(f"the run to continue had other settings ({'; '.join(differing)})")
+    if saved_views != [view.name for view in scene.train_views]:
+        raise CheckpointError("the run to continue was trained on other views; give the same scene")
+
+
+def optimizer_tensors(model: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     """Adam's moments by the names of their parameters."""
     names: dict[Tensor, str] = {p: name for name, p in model.named_parameters()}
     result = {}
@@ -102,12 +141,10 @@ def optimizer_tensors(model: TrainedModel, optimizer: torch.optim.Optimizer) -> 
     return result
 
 
-def restore_optimizer(
-    model: TrainedModel, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]
-) -> None:
+def restore_optimizer(model: nn.Module, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
     """Inverse of `optimizer_tensors`."""
     parameters = dict(model.named_parameters())
     for name, value in tensors.items():
         parameter, key = name.rsplit("/", 1)
         state = optimizer.state.setdefault(parameters[parameter], {})
-        state[key] = value if key == "step" else value.to(parameters[parameter].device)
+        state[key] = value.to(parameters[parameter].device)  # (fused Adam has its step there, too)

@@ -1,9 +1,8 @@
 """Rate-distortion optimization of one scene (CompGS Sec. 3.4): a loop short enough to read aloud."""
 
 import math
-import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from compgs.config import Config, check_config, load_config
 from compgs.entropy import Quantized
 from compgs.entropy.network import FRACTION_BITS
 from compgs.entropy.quantization import UniformNoise, weight_exponent
-from compgs.errors import CheckpointError, ConfigError, TrainingError
+from compgs.errors import ConfigError, TrainingError
 from compgs.losses import (
     Target,
     photometric_loss,
@@ -25,7 +24,7 @@ from compgs.losses import (
     revival_loss,
     scale_regularizer,
 )
-from compgs.model.prediction import OPACITY_CUTOFF, Prediction, predict
+from compgs.model.prediction import OPACITY_CUTOFF, Prediction, camera_center, choosing_pays, predict
 from compgs.render import RasterSettings, rasterize, visible_mask
 from compgs.scene.points import median_spacing, voxel_grid
 from compgs.scene.views import Scene, View
@@ -33,45 +32,23 @@ from compgs.trained_model import BIAS_BITS, TrainedModel
 from compgs.training.checkpoint import (
     CHECKPOINT_NAME,
     Checkpoint,
+    check_same_run,
     load_checkpoint,
     optimizer_tensors,
     restore_optimizer,
     save_checkpoint,
 )
 from compgs.training.control import AdaptiveControl, make_schedule
-from compgs.training.interrupt import held_back
-from compgs.training.optimizers import make_optimizer, set_learning_rates
+from compgs.training.loop import StepResult, TrainingStatus, next_view, run_to_end
+from compgs.training.optimizers import make_optimizer, set_learning_rates, step_rows
 from compgs.training.profile import NoProfile, StepProfile
 from compgs.training.rate_control import RateState, due, follow
 
 # With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
 FEW_DRAWN = 0.1
-REPORT_EVERY = 10  # steps between two status reports
-ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it looks at every anchor
 POSITION_BITS = 10.0  # bits per anchor position, for the estimate only
 OTHER_BYTES = 400  # scene, tables, metadata, container, for the estimate only
 SHARES = 10  # looks in a run at how much the last step drops, where the size is controlled
-
-
-@dataclass(frozen=True)
-class TrainingStatus:
-    """What a progress display shows."""
-
-    step: int
-    steps: int
-    loss: float
-    psnr: float  # dB, of the last training view
-    anchors: int
-    estimated_bytes: int
-    seconds_per_step: float
-    lmbda: float  # weight of the rate; follows the size where one is asked for
-
-
-@dataclass(frozen=True)
-class StepResult:
-    loss: float
-    image: Tensor  # [H, W, 3]
-    view: View
 
 
 def train(
@@ -144,7 +121,7 @@ class Trainer:
     def train_step(self) -> StepResult:
         """Quantize, predict, rasterize, compare, pull (the paper's Fig. 2 from left to right)."""
         t, progress = self.config.training, self.step / self.config.training.steps
-        view_index = self.next_view()
+        view_index = next_view(self.order, len(self.scene.train_views), self.shuffle)
         view = self.scene.train_views[view_index]
         stored = progress >= t.quantized_weights
         profile = self.profile
@@ -166,9 +143,8 @@ class Trainer:
         if self.schedule.active(self.step):
             rendered.means2d.retain_grad()
         distortion = photometric_loss(rendered.image, self.target(view_index), t.ssim_weight)
-        loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales)
-        if len(prediction.index) < FEW_DRAWN * len(prediction.opacities):
-            loss = loss + revival_loss(prediction.opacities)
+        loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales, prediction.drawn)
+        loss = loss + self.revival(prediction)
         profile.lap("loss")
         if latents.bits:
             elements = self.elements(len(rows))
@@ -190,6 +166,8 @@ class Trainer:
         profile.lap("entropy, backward")
 
         set_learning_rates(self.optimizer, progress, t.head_warm_up)
+        if t.sparse_adam:
+            step_rows(self.model, self.optimizer, rows)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         if not self.config.model.residuals:
@@ -205,20 +183,23 @@ class Trainer:
         profile.end()
         self.step += 1
         self.control_rate()
-        return StepResult(float(loss.detach()), rendered.image.detach(), view)
+        return StepResult(loss.detach(), rendered.image.detach(), view)
+
+    def revival(self, prediction: Prediction) -> Tensor | float:
+        """The loss that keeps a scene of which hardly anything is drawn from vanishing; 0 otherwise."""
+        if prediction.drawn is not None:
+            few = prediction.drawn.float().mean() < FEW_DRAWN
+            return torch.where(few, revival_loss(prediction.opacities), 0.0)
+        if len(prediction.index) < FEW_DRAWN * len(prediction.opacities):
+            return revival_loss(prediction.opacities)
+        return 0.0
 
     def skip(self, view: View) -> StepResult:
         """A step on a view that no anchor is in: nothing can be learned from it."""
         self.step += 1
         self.control_rate()
         background = torch.tensor(self.scene.background, device=self.device)
-        return StepResult(0.0, background.expand(*view.image.shape), view)
-
-    def next_view(self) -> int:
-        """Every view once in random order, then again."""
-        if not self.order:
-            self.order = [int(i) for i in self.shuffle.permutation(len(self.scene.train_views))]
-        return self.order.pop()
+        return StepResult(torch.zeros(()), background.expand(*view.image.shape), view)
 
     def target(self, view_index: int) -> Target:
         if view_index not in self.targets:
@@ -237,10 +218,17 @@ class Trainer:
         return torch.nonzero(visible_mask(model.positions(), radii, camera, self.settings)).view(-1)
 
     def predict(self, latents: Quantized, rows: Tensor, camera: Camera, stored: bool) -> Prediction:
-        center = torch.as_tensor(camera.center, dtype=torch.float32, device=self.device)
-        weights = self.model.stored_head_weights() if stored else None
-        primitives = self.model.primitives(latents, rows)
-        return predict(self.model.heads, primitives, center, self.model.distance_unit, weights)
+        """On the GPU all primitives of the anchors in view: choosing among them would mean waiting for it."""
+        model = self.model
+        return predict(
+            model.heads,
+            model.primitives(latents, rows),
+            camera_center(camera, self.device),
+            model.distance_unit,
+            model.stored_head_weights() if stored else None,
+            compact=choosing_pays(self.device),
+            appearance_dtype=getattr(torch, self.config.training.appearance_dtype),
+        )
 
     def elements(self, anchors: int) -> dict[str, int]:
         """Number of coded symbols of each stream for so many anchors."""
@@ -270,49 +258,23 @@ class Trainer:
 
     def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
-        t = self.config.training
         if not any(len(self.visible_anchors(view.camera)) for view in self.scene.train_views):
             raise TrainingError(
                 f"{self.scene.name}: no view sees any of the scene's points; are the poses right?"
             )
-        saved = reported = time.perf_counter()
-        estimate, pace, counted = 0, 0.0, self.step
-        try:
-            while self.step < t.steps:
-                with held_back():
-                    result = self.train_step()
-                now = time.perf_counter()
-                if on_progress and (self.step % REPORT_EVERY == 0 or self.step == t.steps):
-                    if self.step % ESTIMATE_EVERY == 0 or not estimate:
-                        estimate = self.estimated_bytes()
-                    recent = (now - reported) / (self.step - counted)
-                    # Smoothed, but not for long: the first steps compile kernels and say nothing of the rest.
-                    pace = recent if not pace or recent < 0.5 * pace else 0.9 * pace + 0.1 * recent
-                    reported, counted = now, self.step
-                    on_progress(self.status(result, estimate, pace))
-                if self.step % REPORT_EVERY == 0 and not np.isfinite(result.loss):
-                    raise TrainingError(
-                        f"step {self.step}: the loss is {result.loss}; try a lower learning rate or another seed"
-                    )
-                if path and now - saved > 60 * t.checkpoint_minutes:
-                    self.save(path)
-                    saved = now
-            self.finish()
-        except KeyboardInterrupt:
-            if path:
-                self.save(path)
-            raise
-        if path:
-            self.save(path)
+        run_to_end(self, self.config.training, path, on_progress)
 
-    def status(self, result: StepResult, estimate: int, pace: float) -> TrainingStatus:
-        photograph = torch.tensor(result.view.image, device=result.image.device) / 255.0
-        error = float(((result.image.clamp(0, 1) - photograph) ** 2).mean())
-        psnr = -10.0 * float(np.log10(max(error, 1e-10)))
-        return TrainingStatus(
-            self.step, self.config.training.steps, result.loss, psnr, self.model.anchors, estimate, pace,
-            self.rate.lmbda,
-        )  # fmt: skip
+    @property
+    def primitives(self) -> int:
+        return self.model.anchors
+
+    @property
+    def kind(self) -> str:
+        return "anchors"
+
+    @property
+    def lmbda(self) -> float:
+        return self.rate.lmbda
 
     def estimated_bytes(self) -> int:
         """Of the file, were it written now."""
@@ -393,17 +355,7 @@ class Trainer:
     @classmethod
     def resumed(cls, scene: Scene, checkpoint: Checkpoint, config: Config, device: torch.device) -> "Trainer":
         """Raises CheckpointError if the run was another scene's or had other settings."""
-        saved = checkpoint.model.config
-        if saved != config:
-            differing = [
-                f"{section}.{key}: {value!r} then, {config.to_dict()[section][key]!r} now"
-                for section, values in saved.to_dict().items()
-                for key, value in values.items()
-                if config.to_dict()[section][key] != value
-            ]
-            raise CheckpointError(f"the run to continue had other settings ({'; '.join(differing)})")
-        if checkpoint.state["views"] != [view.name for view in scene.train_views]:
-            raise CheckpointError("the run to continue was trained on other views; give the same scene")
+        check_same_run(checkpoint.model.config, config, checkpoint.state["views"], scene)
         trainer = cls(scene, config, device, checkpoint.model)
         restore_optimizer(trainer.model, trainer.optimizer, checkpoint.optimizer)
         for name in AdaptiveControl.STATISTICS:

@@ -1,0 +1,249 @@
+"""Splats as a .ply file in the layout of 3DGS (Kerbl et al. 2023): one element `vertex`, all properties float32.
+
+| properties | what |
+|---|---|
+| x y z | mean, world units |
+| nx ny nz | normals, zero: nothing uses them, some programs expect them |
+| f_dc_0 ... 2 | harmonic coefficients of degree 0: red, green, blue |
+| f_rest_0 ... | of degrees 1 to 3, channel by channel: all of red (3, 8 or 15), all of green, all of blue |
+| opacity | logit of the opacity |
+| scale_0 ... 2 | log of the standard deviations, world units |
+| rot_0 ... 3 | quaternion w-x-y-z, not normalized |
+
+Little endian, in this order. The reader takes properties in any order and ignores others (and elements after the
+vertices); what it needs must be there, in single or double precision, finite, and as many rows as the header promises.
+"""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from compgs.errors import SplatFileError
+from compgs.model.spherical_harmonics import MAX_DEGREE, coefficients
+from compgs.model.splats import Splats
+from compgs.outputs import check_output_file, write_bytes
+
+MAX_HEADER_BYTES = 1 << 16
+MAX_LOG_SCALE = 88.0  # its exponential is the largest that float32 holds
+_FORMAT = "format binary_little_endian 1.0"
+_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "<i2"),
+    **dict.fromkeys(("ushort", "uint16"), "<u2"),
+    **dict.fromkeys(("int", "int32"), "<i4"),
+    **dict.fromkeys(("uint", "uint32"), "<u4"),
+    **dict.fromkeys(("float", "float32"), "<f4"),
+    **dict.fromkeys(("double", "float64"), "<f8"),
+}
+_REMEDY = "export the scene again as an uncompressed 3DGS .ply"
+
+
+def numbered(name: str, count: int) -> tuple[str, ...]:
+    """`scale_0`, `scale_1`, `scale_2`."""
+    return tuple(f"{name}_{i}" for i in range(count))
+
+
+def property_groups(degree: int) -> dict[str, tuple[str, ...]]:
+    """Properties in the order of the file, by what they are."""
+    return {
+        "positions": ("x", "y", "z"),
+        "normals": ("nx", "ny", "nz"),
+        "colors": numbered("f_dc", 3),
+        "harmonics": numbered("f_rest", 3 * (coefficients(degree) - 1)),
+        "opacities": ("opacity",),
+        "scales": numbered("scale", 3),
+        "rotations": numbered("rot", 4),
+    }
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """What a file's header promises, checked against its size."""
+
+    count: int  # splats
+    degree: int  # of the spherical harmonics
+    row: np.dtype  # of a vertex
+    start: int  # bytes before the first vertex
+    bytes: int  # of the whole file
+
+
+# writing -----------------------------------------------------------------------------------------------------------
+
+
+def write_ply(splats: Splats, path: str | Path, *, overwrite: bool = False) -> int:
+    """Write splats, whole or not at all; the number of bytes. Raises OutputError."""
+    data = ply_bytes(splats)
+    check_output_file(Path(path), overwrite=overwrite, needed_bytes=len(data))
+    write_bytes(Path(path), data)
+    return len(data)
+
+
+def ply_bytes(splats: Splats) -> bytes:
+    """The content of the file."""
+    names = [name for group in property_groups(splats.degree).values() for name in group]
+    table = np.zeros((len(splats), len(names)), "<f4")
+    for columns, tensor in _columns(splats):
+        first = names.index(columns[0]) if columns else 0
+        table[:, first : first + len(columns)] = tensor.detach().cpu().numpy()
+    return _header_text(len(splats), names) + table.tobytes()
+
+
+def ply_size(count: int, degree: int) -> int:
+    """Bytes of a file of so many splats."""
+    names = [name for group in property_groups(degree).values() for name in group]
+    return len(_header_text(count, names)) + 4 * len(names) * count
+
+
+def _header_text(count: int, names: list[str]) -> bytes:
+    lines = ["ply", _FORMAT, f"element vertex {count}", *(f"property float {name}" for name in names)]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+
+
+def _columns(splats: Splats) -> list[tuple[tuple[str, ...], Tensor]]:
+    """Names and values [M, ...] of everything that a file holds but the normals."""
+    groups = property_groups(splats.degree)
+    return [
+        (groups["positions"], splats.means),
+        (groups["colors"], splats.dc),
+        (groups["harmonics"], splats.rest.transpose(1, 2).reshape(len(splats), -1)),
+        (groups["opacities"], splats.opacity_logits[:, None]),
+        (groups["scales"], splats.log_scales),
+        (groups["rotations"], splats.quaternions),
+    ]
+
+
+# reading -----------------------------------------------------------------------------------------------------------
+
+
+def read_ply(path: str | Path) -> Splats:
+    """Inverse of `write_ply`. Raises SplatFileError, naming the first thing that is wrong."""
+    path = Path(path)
+    header = read_ply_header(path)
+    table = np.memmap(path, header.row, "r", header.start, (header.count,))
+    groups = property_groups(header.degree)
+
+    def values(group: str) -> Tensor:
+        names = groups[group]
+        array = np.empty((header.count, len(names)), np.float32)
+        with np.errstate(over="ignore"):  # a double that is too large becomes infinite, and is refused
+            for i, name in enumerate(names):
+                array[:, i] = table[name]
+                _check_numbers(path, name, array[:, i])
+        return torch.from_numpy(array)
+
+    log_scales, quaternions = values("scales"), values("rotations")
+    zero = torch.nonzero(~quaternions.any(1)).view(-1)
+    if len(zero):
+        raise SplatFileError(
+            f"{path}: rot_0 to rot_3 of splat {int(zero[0])} are all zero, which is no rotation; {_REMEDY}"
+        )
+    harmonics = values("harmonics").view(header.count, 3, coefficients(header.degree) - 1)
+    return Splats(
+        means=values("positions"),
+        log_scales=log_scales,
+        quaternions=quaternions,
+        opacity_logits=values("opacities")[:, 0].contiguous(),
+        dc=values("colors"),
+        rest=harmonics.transpose(1, 2).contiguous(),
+    )
+
+
+def read_ply_header(path: str | Path) -> PlyHeader:
+    """Everything that can be known without reading the splats. Raises SplatFileError."""
+    path = Path(path)
+    try:
+        size = os.path.getsize(path)
+        with open(path, "rb") as file:
+            begin = file.read(MAX_HEADER_BYTES)
+    except OSError as error:
+        raise SplatFileError(f"{path}: cannot be read ({error.strerror or error})") from error
+    end = begin.find(b"end_header")
+    newline = begin.find(b"\n", end)
+    if not begin.startswith((b"ply\n", b"ply\r\n")):
+        raise SplatFileError(f"{path}: does not begin as a .ply file does")
+    if end < 0 or newline < 0:
+        raise SplatFileError(f"{path}: the header does not end within {MAX_HEADER_BYTES} bytes")
+    lines = begin[:end].decode("ascii", errors="replace").split("\n")
+    count, columns, others = _vertices(path, [line.split() for line in lines])
+    row = np.dtype(columns)
+    degree = _degree(path, row)
+    start = newline + 1
+    promised = start + count * row.itemsize
+    if size < promised or (size > promised and not others):
+        raise SplatFileError(
+            f"{path}: {count} splats of {row.itemsize} bytes are {promised} bytes with the header, "
+            f"the file has {size}; copy it again"
+        )
+    if count == 0:
+        raise SplatFileError(f"{path}: holds no splats")
+    return PlyHeader(count, degree, row, start, size)
+
+
+def _vertices(path: Path, lines: list[list[str]]) -> tuple[int, list[tuple[str, str]], bool]:
+    """Number of vertices, names and types of their properties, and whether other elements follow."""
+    count, columns, element, others = -1, [], "", False
+    for words in lines[1:]:
+        if words[:1] == ["format"] and " ".join(words) != _FORMAT:
+            raise SplatFileError(f"{path}: expected {_FORMAT!r}, found {' '.join(words)!r}; {_REMEDY}")
+        if words[:1] == ["element"]:
+            element = words[1] if len(words) == 3 else ""
+            if count < 0 and not (element == "vertex" and words[2].isdecimal() and len(words[2]) <= 12):
+                raise SplatFileError(
+                    f"{path}: expected 'element vertex COUNT' first, found {' '.join(words)!r}; {_REMEDY}"
+                )
+            others = others or element != "vertex"
+            count = int(words[2]) if count < 0 else count
+        elif words[:1] == ["property"] and element == "vertex":
+            if len(words) != 3 or words[1] not in _TYPES:
+                raise SplatFileError(
+                    f"{path}: {' '.join(words)!r} is not a property that a splat has; {_REMEDY}"
+                )
+            columns.append((words[2], _TYPES[words[1]]))
+    names = [name for name, _ in columns]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise SplatFileError(f"{path}: property {twice!r} is there twice; {_REMEDY}")
+    if count < 0:
+        raise SplatFileError(f"{path}: the header has no vertices; {_REMEDY}")
+    return count, columns, others
+
+
+def _degree(path: Path, row: np.dtype) -> int:
+    """Of the harmonics, from the number of f_rest; every property that is needed must be there."""
+    found = set(row.names or ())
+    held = sum(name.startswith("f_rest_") for name in found)
+    degrees = {3 * (coefficients(d) - 1): d for d in range(MAX_DEGREE + 1)}
+    if held not in degrees:
+        raise SplatFileError(
+            f"{path}: {held} properties f_rest_*; expected {', '.join(map(str, degrees))} (degree 0 to 3)"
+        )
+    groups = property_groups(degrees[held])
+    for group, names in groups.items():
+        for name in names:
+            if group == "normals":
+                continue
+            if name not in found:
+                hint = "these are points, not splats" if "f_dc_0" not in found else _REMEDY
+                raise SplatFileError(f"{path}: property {name!r} is missing; {hint}")
+            if row[name].kind != "f":
+                raise SplatFileError(
+                    f"{path}: property {name!r} is of type {row[name]}, expected float or double"
+                )
+    return degrees[held]
+
+
+def _check_numbers(path: Path, name: str, column: np.ndarray) -> None:
+    bad = ~np.isfinite(column)
+    if name.startswith("scale_"):
+        bad |= column > MAX_LOG_SCALE
+    if bad.any():
+        first = int(np.argmax(bad))
+        legal = f"a finite number up to {MAX_LOG_SCALE:g}" if name.startswith("scale_") else "a finite number"
+        raise SplatFileError(
+            f"{path}: {name} of splat {first} is {column[first]}, expected {legal}; {_REMEDY}"
+        )

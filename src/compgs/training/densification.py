@@ -1,0 +1,141 @@
+"""Adaptive density control of plain 3DGS (Kerbl et al. 2023, Sec. 5.2): clone, split, prune, reset opacities.
+
+Where the image still pulls at a splat's 2D mean, small splats are cloned and large ones split in two; transparent
+splats are removed, and after the first reset of the opacities also those that are too large for the scene. (The
+published program also removes what is large in the image; gsplat by default does not, and neither do we.)
+
+The published schedule counts steps of a run of 30 000. As mere fractions of a short run, it would judge splats that no
+view has shown since, and reset opacities faster than they recover. So there are floors: a pass over the views between
+two judgements, `RECOVERY_PASSES` between two resets, and no reset without the time to recover from it before
+densification ends. Floors end at the published numbers of steps: a run of 30 000 steps goes as published.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from compgs.cameras import Camera
+from compgs.config import SplatConfig
+from compgs.model.splats import Splats
+from compgs.training.splat_parameters import SplatParameters, replace_splats
+
+PUBLISHED_START, PUBLISHED_EVERY, PUBLISHED_RESET = 500, 100, 3_000  # steps
+RECOVERY_PASSES = 5  # over the views: opacities are back after some hundred steps in which a splat is seen
+SPLIT_INTO = 2
+SPLIT_SHRINK = 1.6  # 0.8 x the number of parts: how much smaller a part is
+
+
+@dataclass(frozen=True)
+class DensifySchedule:
+    """Steps of a run at which density control acts, and those at which opacities are reset."""
+
+    start: int
+    stop: int
+    every: int
+    reset_every: int
+
+    def active(self, step: int) -> bool:
+        """Gradients are gathered in this step."""
+        return step < self.stop
+
+    def due(self, step: int) -> bool:
+        return self.start <= step < self.stop and (step - self.start) % self.every == 0
+
+    def reset_due(self, step: int) -> bool:
+        """Not so late that opacities would not be back before densification ends."""
+        last = self.stop - self.reset_every // 2
+        return 0 < step <= last and step % self.reset_every == 0
+
+
+def densify_schedule(config: SplatConfig, steps: int, views: int) -> DensifySchedule:
+    """Fractions of the run in steps; see the module's docstring for the floors."""
+    return DensifySchedule(
+        start=max(1, round(config.densify_start * steps), min(views, PUBLISHED_START)),
+        stop=round(config.densify_stop * steps),
+        every=max(1, round(config.densify_every * steps), min(views, PUBLISHED_EVERY)),
+        reset_every=max(1, round(config.reset_every * steps), min(RECOVERY_PASSES * views, PUBLISHED_RESET)),
+    )
+
+
+class DensityControl:
+    """How much the image pulls at each splat since densities were last controlled, and what follows from it."""
+
+    def __init__(
+        self,
+        config: SplatConfig,
+        extent: float,  # of the scene, world units
+        splats: int,
+        device: torch.device,
+    ) -> None:
+        self.config = config
+        self.extent = extent
+        self.gradient = torch.zeros(splats, device=device)  # sum of 2D gradient norms, in half images
+        self.seen = torch.zeros(splats, device=device)  # views in which the splat was drawn
+
+    STATISTICS = ("gradient", "seen")
+
+    @torch.no_grad()
+    def observe(self, mean_gradient: Tensor, visible: Tensor, camera: Camera) -> None:
+        """One training view: gradient of the loss by the 2D means [M, 2], which splats were drawn [M] bool."""
+        half_image = mean_gradient.new_tensor([camera.width / 2, camera.height / 2])
+        self.gradient += (mean_gradient * half_image).norm(dim=1)  # (zero where it was not drawn)
+        self.seen += visible
+
+    @torch.no_grad()
+    def act(
+        self,
+        parameters: SplatParameters,
+        optimizer: torch.optim.Adam,
+        chance: torch.Generator,
+        *,
+        remove_large: bool,
+    ) -> None:
+        """Clone, split and prune; statistics start anew. If nothing would be left, nothing is removed."""
+        c, splats = self.config, parameters.trained()
+        asks = self._densified(self.gradient / self.seen.clamp_min(1))
+        large = splats.log_scales.amax(1).exp() > c.split_size * self.extent
+        clones = splats.rows(torch.nonzero(asks & ~large).view(-1))
+        parts = split(splats.rows(torch.nonzero(asks & large).view(-1)), chance)
+        added = Splats(**{name: torch.cat([t, getattr(parts, name)]) for name, t in vars(clones).items()})
+        kept = ~(asks & large) & ~self._superfluous(splats, remove_large)
+        added = added.rows(torch.nonzero(~self._superfluous(added, remove_large)).view(-1))
+        if kept.any() or len(added):
+            replace_splats(parameters, optimizer, kept, added)
+        self.gradient = self.gradient.new_zeros(len(parameters))
+        self.seen = self.seen.new_zeros(len(parameters))
+
+    def _densified(self, gradient: Tensor) -> Tensor:
+        """[M] bool: splats with a gradient [M] above the threshold; the strongest, if all would be too many."""
+        asks = gradient >= self.config.gradient_threshold
+        room = max(0, self.config.max_splats - len(gradient))  # each clone and each split adds one
+        if int(asks.sum()) > room:
+            strongest = torch.sort(torch.where(asks, gradient, -1.0), descending=True, stable=True).indices
+            asks = torch.zeros_like(asks)
+            asks[strongest[:room]] = True
+        return asks
+
+    def _superfluous(self, splats: Splats, remove_large: bool) -> Tensor:
+        """[M] bool: too transparent, or (if asked) too large."""
+        removed = splats.opacity_logits.sigmoid() < self.config.prune_opacity
+        if remove_large:
+            removed |= splats.log_scales.amax(1).exp() > self.config.prune_size * self.extent
+        return removed
+
+
+def split(splats: Splats, chance: torch.Generator) -> Splats:
+    """Smaller splats in place of each, at random places within it: SPLIT_INTO blocks of M, one after the other."""
+    rows = torch.arange(len(splats), device=splats.means.device).repeat(SPLIT_INTO)
+    parts = splats.rows(rows)
+    within = torch.randn(parts.means.shape, generator=chance, device=parts.means.device)
+    offset = rotate(parts.quaternions, within * parts.log_scales.exp())
+    shrunk = parts.log_scales - torch.log(torch.tensor(SPLIT_SHRINK)).item()
+    return replace(parts, means=parts.means + offset, log_scales=shrunk)
+
+
+def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:  # [M, 4] w-x-y-z, [M, 3] -> [M, 3]
+    """Vectors turned by (unnormalized) quaternions."""
+    unit = torch.nn.functional.normalize(quaternions, dim=1)
+    w, axis = unit[:, :1], unit[:, 1:]
+    across = torch.linalg.cross(axis, vectors)
+    return vectors + 2 * (w * across + torch.linalg.cross(axis, across))

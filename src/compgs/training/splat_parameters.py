@@ -1,0 +1,118 @@
+"""The trainable splats of plain 3DGS, how they begin, and the optimizer over them (Kerbl et al. 2023, Sec. 5 and 6)."""
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from compgs.config import SplatConfig
+from compgs.model.spherical_harmonics import coefficients, dc_from_color
+from compgs.model.splats import Splats
+from compgs.scene.views import Points
+from compgs.training.optimizers import ADAM_EPSILON
+
+NEIGHBOURS = 3  # of a point: their mean distance is the size of its splat
+SMALLEST_SCALE = 1e-7**0.5  # world units, of splats whose neighbours are in the same place (3DGS)
+
+
+class SplatParameters(nn.Module):
+    """`Splats` with gradients."""
+
+    def __init__(self, splats: Splats) -> None:
+        super().__init__()
+        self.means = nn.Parameter(splats.means)
+        self.log_scales = nn.Parameter(splats.log_scales)
+        self.quaternions = nn.Parameter(splats.quaternions)
+        self.opacity_logits = nn.Parameter(splats.opacity_logits)
+        self.dc = nn.Parameter(splats.dc)
+        self.rest = nn.Parameter(splats.rest)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def splats(self) -> Splats:
+        """The parameters themselves, in the autograd graph."""
+        return Splats(self.means, self.log_scales, self.quaternions, self.opacity_logits, self.dc, self.rest)
+
+    @torch.no_grad()
+    def trained(self) -> Splats:
+        """A copy without gradients."""
+        return Splats(**{name: p.detach().clone() for name, p in self.named_parameters()})
+
+
+def initial_splats(points: Points, config: SplatConfig) -> Splats:
+    """Every point becomes a round splat of its color, as large as the distance to its neighbours."""
+    n = len(points)
+    neighbours = min(NEIGHBOURS + 1, n)
+    distances = cKDTree(points.positions).query(points.positions, k=neighbours)[0].reshape(n, neighbours)
+    spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(n)
+    spread = np.maximum(spread, SMALLEST_SCALE)
+    opacity = torch.full((n,), config.initial_opacity)
+    return Splats(
+        means=torch.tensor(points.positions, dtype=torch.float32),
+        log_scales=torch.from_numpy(np.log(spread)).float()[:, None].repeat(1, 3),
+        quaternions=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
+        opacity_logits=torch.logit(opacity),
+        dc=dc_from_color(torch.from_numpy(points.colors / 255.0).float()),
+        rest=torch.zeros(n, coefficients(config.harmonics) - 1, 3),
+    )
+
+
+def make_splat_optimizer(
+    parameters: SplatParameters,
+    config: SplatConfig,
+    extent: float,  # of the scene, world units
+) -> torch.optim.Adam:
+    """One group a parameter, for `training.optimizers.set_learning_rates`: only positions slow down."""
+    first, last = config.position_lr
+    rates = {
+        "means": (first * extent, last * extent),
+        "log_scales": (config.log_scale_lr, config.log_scale_lr),
+        "quaternions": (config.rotation_lr, config.rotation_lr),
+        "opacity_logits": (config.opacity_lr, config.opacity_lr),
+        "dc": (config.color_lr, config.color_lr),
+        "rest": (config.harmonics_lr, config.harmonics_lr),
+    }
+    groups = [
+        {"name": name, "params": [parameter], "lr": rates[name][0], "rates": rates[name]}
+        for name, parameter in parameters.named_parameters()
+        if parameter.numel() > 0
+    ]
+    return torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
+
+
+@torch.no_grad()
+def replace_splats(
+    parameters: SplatParameters, optimizer: torch.optim.Adam, kept: Tensor, added: Splats
+) -> None:
+    """Keep some splats, [M] bool, and append others, in the parameters and in Adam's moments (zero for new ones)."""
+    for name, new in vars(added).items():
+        old = getattr(parameters, name)
+        _replace(parameters, optimizer, name, torch.cat([old.detach()[kept], new]))
+        state = optimizer.state.get(getattr(parameters, name))
+        if state:
+            for moment in ("exp_avg", "exp_avg_sq"):
+                state[moment] = torch.cat([state[moment][kept], torch.zeros_like(new)])
+
+
+@torch.no_grad()
+def reset_opacities(parameters: SplatParameters, optimizer: torch.optim.Adam, opacity: float) -> None:
+    """Opacities above `opacity` fall to it: those that the views need come back, the others are pruned."""
+    highest = torch.logit(torch.tensor(opacity)).item()
+    _replace(parameters, optimizer, "opacity_logits", parameters.opacity_logits.clamp_max(highest))
+    state = optimizer.state.get(parameters.opacity_logits)
+    if state:
+        for moment in ("exp_avg", "exp_avg_sq"):
+            state[moment].zero_()
+
+
+def _replace(parameters: SplatParameters, optimizer: torch.optim.Adam, name: str, value: Tensor) -> None:
+    """A parameter's new value, which may have other rows; Adam's state goes along as it is."""
+    old, new = getattr(parameters, name), nn.Parameter(value)
+    setattr(parameters, name, new)
+    for group in optimizer.param_groups:
+        if group["name"] == name:
+            group["params"] = [new]
+    state = optimizer.state.pop(old, None)
+    if state:
+        optimizer.state[new] = state

@@ -1,0 +1,225 @@
+"""Plain 3D Gaussian Splatting (Kerbl et al. 2023): what compression is measured against.
+
+    splats ──activate, harmonics──► Gaussians ──rasterize──► image ──(1 - w) L1 + w (1 - SSIM)──► loss
+
+Same scenes, views, rasterizer, loss and evaluation as the hybrid method's (`training/trainer.py`); no networks, no
+quantization, no rate.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from compgs.config import Config, check_config, config_from_dict, load_config
+from compgs.errors import ConfigError, TrainingError
+from compgs.losses import Target, photometric_loss
+from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
+from compgs.render import RasterSettings, rasterize, visible_mask
+from compgs.scene.views import Scene
+from compgs.training.checkpoint import (
+    CHECKPOINT_NAME,
+    check_same_run,
+    optimizer_tensors,
+    read_checkpoint_file,
+    restore_optimizer,
+    tensors_by_kind,
+    write_checkpoint_file,
+)
+from compgs.training.densification import DensityControl, densify_schedule
+from compgs.training.loop import StepResult, TrainingStatus, next_view, run_to_end
+from compgs.training.optimizers import set_learning_rates
+from compgs.training.profile import NoProfile, StepProfile
+from compgs.training.splat_parameters import (
+    SplatParameters,
+    initial_splats,
+    make_splat_optimizer,
+    reset_opacities,
+)
+
+METHOD = "3dgs"
+# Numbers of a splat in a .ply file of degree 0: position, normal, color, opacity, scales, rotation.
+STORED_NUMBERS = 3 + 3 + 3 + 1 + 3 + 4
+
+
+def train_splats(
+    scene: Scene,
+    config: Config | None = None,
+    *,
+    preset: str = "default",
+    output: str | Path | None = None,
+    resume: bool = False,
+    on_progress: Callable[[TrainingStatus], None] | None = None,
+    device: str | torch.device | None = None,
+    profile: StepProfile | None = None,
+) -> SplatModel:
+    """Train plain 3DGS on a scene; the result is ready for `compgs.export.write_ply`. Arguments as of `train`.
+
+    Of the settings, `splats` applies, and of `training` the steps, the seed, the loss and the checkpoints.
+
+    Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
+    """
+    config = config or load_config(preset)
+    check_config(config)
+    chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    path = Path(output) / CHECKPOINT_NAME if output is not None else None
+    if resume:
+        if path is None:
+            raise ConfigError("resume needs an output folder: the one of the run to continue")
+        trainer = SplatTrainer.resumed(scene, path, config, chosen)
+    else:
+        trainer = SplatTrainer(scene, config, chosen)
+    trainer.profile = profile or trainer.profile
+    trainer.run(path, on_progress)
+    return SplatModel(trainer.parameters.trained(), scene.background)
+
+
+class SplatTrainer:
+    """State of a run: splats, optimizer, density control, and the order in which views come."""
+
+    kind = "splats"
+    lmbda = None  # nothing is weighed against the size
+
+    def __init__(
+        self, scene: Scene, config: Config, device: torch.device, splats: Splats | None = None
+    ) -> None:
+        if not scene.train_views:
+            raise ConfigError(f"{scene.name}: no training views are left after holding out the test views")
+        self.scene = scene
+        self.config = config
+        self.device = device
+        self.parameters = SplatParameters((splats or initial_splats(scene.points, config.splats)).to(device))
+        self.optimizer = make_splat_optimizer(self.parameters, config.splats, scene.extent)
+        self.schedule = densify_schedule(config.splats, config.training.steps, len(scene.train_views))
+        self.control = DensityControl(config.splats, scene.extent, len(self.parameters), device)
+        self.chance = torch.Generator(device).manual_seed(config.training.seed + 1)  # of splits
+        self.shuffle = np.random.default_rng(config.training.seed + 2)
+        self.order: list[int] = []
+        self.targets: dict[int, Target] = {}
+        self.settings = RasterSettings(background=scene.background)
+        self.step = 0
+        self.profile: StepProfile = NoProfile()
+
+    @property
+    def primitives(self) -> int:
+        return len(self.parameters)
+
+    def degree(self) -> int:
+        """Of the harmonics in use: it rises with the run, so that colors settle before their variation."""
+        s, steps = self.config.splats, self.config.training.steps
+        every = max(1, round(s.harmonics_every * steps))
+        return min(s.harmonics, self.step // every)
+
+    # one step ------------------------------------------------------------------------------------------------------
+
+    def train_step(self) -> StepResult:
+        """Activate, rasterize, compare, pull; then control density."""
+        view_index = next_view(self.order, len(self.scene.train_views), self.shuffle)
+        view = self.scene.train_views[view_index]
+        splats = self.parameters.splats()
+        gathers = self.schedule.active(self.step)
+        profile = self.profile
+        profile.begin()
+
+        inside = visible_mask(splats.means.detach(), splat_radii(splats), view.camera, self.settings)
+        profile.lap("culling")
+        gaussians = splat_gaussians(splats, view.camera, self.degree(), inside)
+        profile.lap("activation and harmonics")
+        rendered = rasterize(gaussians, view.camera, self.settings)
+        profile.lap("projection and rasterization")
+        if gathers:
+            rendered.means2d.retain_grad()
+        loss = photometric_loss(rendered.image, self.target(view_index), self.config.training.ssim_weight)
+        profile.lap("loss")
+        profile.lap_on_gradient("loss, backward", rendered.image)
+        profile.lap_on_gradient("rasterization, backward", rendered.means2d)
+        # Autograd goes back in the opposite order: through the projection, then through the harmonics.
+        profile.lap_on_gradient("projection, backward", gaussians.colors)
+        loss.backward()
+        profile.lap("activation and harmonics, backward")
+
+        set_learning_rates(self.optimizer, self.step / self.config.training.steps)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        profile.lap("optimizer")
+        if gathers and rendered.means2d.grad is not None:
+            self.control.observe(rendered.means2d.grad, rendered.visible, view.camera)
+        self.step += 1
+        self.control_density()
+        profile.lap("density control")
+        profile.end()
+        return StepResult(loss.detach(), rendered.image.detach(), view)
+
+    def control_density(self) -> None:
+        """What the schedule asks for after so many steps."""
+        if self.schedule.due(self.step):
+            self.control.act(
+                self.parameters,
+                self.optimizer,
+                self.chance,
+                remove_large=self.step > self.schedule.reset_every,
+            )
+        if self.schedule.reset_due(self.step):
+            reset_opacities(self.parameters, self.optimizer, self.config.splats.reset_opacity)
+
+    def target(self, view_index: int) -> Target:
+        if view_index not in self.targets:
+            self.targets[view_index] = Target.from_image(
+                self.scene.train_views[view_index].image, self.device
+            )
+        return self.targets[view_index]
+
+    # the run -------------------------------------------------------------------------------------------------------
+
+    def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
+        """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
+        bounds = self.parameters.means.detach(), splat_radii(self.parameters.splats())
+        if not any(visible_mask(*bounds, v.camera, self.settings).any() for v in self.scene.train_views):
+            raise TrainingError(
+                f"{self.scene.name}: no view sees any of the scene's points; are the poses right?"
+            )
+        run_to_end(self, self.config.training, path, on_progress)
+
+    def estimated_bytes(self) -> int:
+        """Of the .ply file, were it written now: its size without the header."""
+        return 4 * len(self.parameters) * (STORED_NUMBERS + self.parameters.rest[0].numel())
+
+    def finish(self) -> None:
+        """Nothing is left to do: the file holds the splats as they are."""
+
+    # checkpoints ---------------------------------------------------------------------------------------------------
+
+    def save(self, path: Path) -> None:
+        tensors = {f"model/{name}": p for name, p in vars(self.parameters.trained()).items()}
+        moments = optimizer_tensors(self.parameters, self.optimizer)
+        tensors |= {f"optimizer/{name}": value for name, value in moments.items()}
+        tensors |= {f"extra/control/{n}": getattr(self.control, n) for n in DensityControl.STATISTICS}
+        tensors["extra/chance"] = self.chance.get_state()
+        state = {
+            "step": self.step,
+            "order": self.order,
+            "shuffle": self.shuffle.bit_generator.state,
+            "views": [view.name for view in self.scene.train_views],
+        }
+        metadata = {"config": json.dumps(self.config.to_dict()), "state": json.dumps(state)}
+        write_checkpoint_file(path, METHOD, tensors, metadata)
+
+    @classmethod
+    def resumed(cls, scene: Scene, path: Path, config: Config, device: torch.device) -> "SplatTrainer":
+        """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
+        tensors, metadata = read_checkpoint_file(path, METHOD)
+        state = json.loads(metadata["state"])
+        saved = config_from_dict(json.loads(metadata["config"]), str(path))
+        check_same_run(saved, config, state["views"], scene)
+        parts = tensors_by_kind(tensors)
+        trainer = cls(scene, config, device, Splats(**parts["model"]))
+        restore_optimizer(trainer.parameters, trainer.optimizer, parts["optimizer"])
+        for name in DensityControl.STATISTICS:
+            setattr(trainer.control, name, parts["extra"][f"control/{name}"].to(device))
+        trainer.chance.set_state(parts["extra"]["chance"])
+        trainer.shuffle.bit_generator.state = state["shuffle"]
+        trainer.order = state["order"]
+        trainer.step = state["step"]
+        return trainer

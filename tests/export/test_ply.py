@@ -1,0 +1,172 @@
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from compgs.errors import OutputError, SplatFileError
+from compgs.export import read_ply, write_ply
+from compgs.export.ply import ply_size, read_ply_header
+from compgs.model.splats import Splats
+
+REAL = Path("/work/shared/splats")
+
+
+def made(count: int = 5, degree: int = 3) -> Splats:
+    g = torch.Generator().manual_seed(degree)
+    draw = lambda *shape: torch.randn(*shape, generator=g)  # noqa: E731
+    harmonics = (degree + 1) ** 2 - 1
+    return Splats(
+        draw(count, 3), draw(count, 3), draw(count, 4), draw(count), draw(count, 3), draw(count, harmonics, 3)
+    )
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.ply"
+    write_ply(made(), path)
+    return path
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_is_written_is_read_again_bit_by_bit(tmp_path: Path, degree: int) -> None:
+    splats = made(7, degree)
+    written = write_ply(splats, tmp_path / "scene.ply")
+    again = read_ply(tmp_path / "scene.ply")
+    assert again.degree == degree
+    for name, tensor in vars(splats).items():
+        assert torch.equal(getattr(again, name), tensor), name
+    assert written == (tmp_path / "scene.ply").stat().st_size == ply_size(7, degree)
+
+
+def test_the_layout_is_that_of_3dgs(file: Path) -> None:
+    """Read by hand, from the description of the layout alone."""
+    splats, data = made(), file.read_bytes()
+    header, body = data.split(b"end_header\n")
+    names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float")]
+    expected = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    expected += [f"f_rest_{i}" for i in range(45)]
+    expected += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert names == expected
+    assert header.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 5\n")
+    second = dict(zip(names, struct.unpack_from("<62f", body, 4 * 62), strict=True))
+    assert second["y"] == splats.means[1, 1] and second["nx"] == 0
+    assert second["f_dc_2"] == splats.dc[1, 2]
+    assert second["f_rest_0"] == splats.rest[1, 0, 0]  # red, first harmonic
+    assert second["f_rest_14"] == splats.rest[1, 14, 0]  # red, last harmonic
+    assert second["f_rest_17"] == splats.rest[1, 2, 1]  # green, third harmonic
+    assert second["f_rest_30"] == splats.rest[1, 0, 2]  # blue, first harmonic
+    assert second["rot_0"] == splats.quaternions[1, 0] and second["opacity"] == splats.opacity_logits[1]
+
+
+def test_an_existing_file_is_kept_unless_asked(file: Path) -> None:
+    before = file.read_bytes()
+    with pytest.raises(OutputError, match="overwrite"):
+        write_ply(made(2), file)
+    assert file.read_bytes() == before
+    write_ply(made(2), file, overwrite=True)
+    assert len(read_ply(file)) == 2
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
+
+
+def test_properties_may_come_in_any_order_and_precision_and_with_others(tmp_path: Path) -> None:
+    splats = made(3, 0)
+    names = ["rot_3", "rot_0", "rot_1", "rot_2", "opacity", "f_dc_2", "f_dc_0", "f_dc_1", "x", "y", "z"]
+    names += ["scale_2", "scale_1", "scale_0"]
+    table = np.zeros(3, [("label", "u1"), *((name, "<f8") for name in names), ("time", "<i4")])
+    for stem, values in {"rot": splats.quaternions, "f_dc": splats.dc, "scale": splats.log_scales}.items():
+        for i in range(values.shape[1]):
+            table[f"{stem}_{i}"] = values[:, i]
+    table["x"], table["y"], table["z"] = splats.means.T.numpy()
+    table["opacity"] = splats.opacity_logits
+    header = "ply\r\nformat binary_little_endian 1.0\r\ncomment made elsewhere\r\nelement vertex 3\r\n"
+    header += "property uchar label\r\n" + "".join(f"property double {name}\r\n" for name in names)
+    header += "property int time\r\nelement camera 1\r\nproperty list uchar int ids\r\nend_header\r\n"
+    path = tmp_path / "other.ply"
+    path.write_bytes(header.encode() + table.tobytes() + b"\x01\x00\x00\x00\x00")
+    again = read_ply(path)
+    for name, tensor in vars(splats).items():
+        assert torch.equal(getattr(again, name), tensor), name
+
+
+def edited(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
+    return lambda data: data.replace(old, new, 1)
+
+
+def with_number(column: int, value: float) -> Callable[[bytes], bytes]:
+    """In the third row."""
+
+    def change(data: bytes) -> bytes:
+        start = data.index(b"end_header\n") + 11 + 4 * (2 * 62 + column)
+        return data[:start] + struct.pack("<f", value) + data[start + 4 :]
+
+    return change
+
+
+def without_rotation(data: bytes) -> bytes:
+    start = data.index(b"end_header\n") + 11 + 4 * (62 + 58)
+    return data[:start] + bytes(16) + data[start + 16 :]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda data: b"", "does not begin"),
+        (lambda data: b"PK" + data, "does not begin"),
+        (lambda data: data[:300], "header does not end"),
+        (lambda data: data[:-1], "copy it again"),
+        (lambda data: data + b"x", "copy it again"),
+        (edited(b"vertex 5", b"vertex 6"), "copy it again"),
+        (edited(b"vertex 5", b"vertex 999999999999"), "copy it again"),
+        (edited(b"vertex 5", b"vertex 9999999999999"), "element vertex COUNT"),
+        (edited(b"vertex 5", b"vertex -5"), "element vertex COUNT"),
+        (edited(b"vertex 5", b"vertex"), "element vertex COUNT"),
+        (edited(b"element vertex 5", b"element chunk 5"), "element vertex COUNT"),
+        (edited(b"element vertex 5\n", b""), "no vertices"),
+        (edited(b"binary_little", b"binary_big"), "binary_little_endian"),
+        (edited(b"property float f_rest_44\n", b""), "44 properties f_rest"),
+        (edited(b"f_rest_44", b"f_rest_45"), "'f_rest_44' is missing"),
+        (edited(b"float opacity", b"float transparency"), "'opacity' is missing"),
+        (edited(b"float opacity", b"int opacity"), "'opacity' is of type int32"),
+        (edited(b"float opacity", b"float x"), "'x' is there twice"),
+        (edited(b"float opacity", b"list uchar int opacity"), "not a property"),
+        (edited(b"float opacity", b"half opacity"), "not a property"),
+        (with_number(1, float("nan")), "y of splat 2 is nan"),
+        (with_number(54, float("inf")), "opacity of splat 2 is inf"),
+        (with_number(20, float("-inf")), "f_rest_11 of splat 2 is -inf"),
+        (with_number(55, 1000.0), "scale_0 of splat 2 is 1000.0"),
+        (without_rotation, "splat 1 are all zero"),
+    ],
+)
+def test_a_damaged_file_is_refused_with_what_is_wrong(
+    file: Path, damage: Callable[[bytes], bytes], message: str
+) -> None:
+    file.write_bytes(damage(file.read_bytes()))
+    with pytest.raises(SplatFileError, match=message) as caught:
+        read_ply(file)
+    assert str(caught.value).startswith(f"{file}: ")
+
+
+def test_points_are_not_taken_for_splats(tmp_path: Path) -> None:
+    path = tmp_path / "points.ply"
+    header = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+    path.write_bytes(header + b"property float z\nend_header\n" + bytes(12))
+    with pytest.raises(SplatFileError, match="points, not splats"):
+        read_ply(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SplatFileError, match=r"none\.ply: cannot be read"):
+        read_ply(tmp_path / "none.ply")
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"no real splats in {REAL}")
+def test_real_splats_of_another_program_are_read() -> None:
+    path = REAL / "playbot_lod3.ply"
+    header, splats = read_ply_header(path), read_ply(path)
+    assert len(splats) == header.count == 31_000
+    assert splats.degree == 2
+    assert 0.3 < splats.opacity_logits.sigmoid().mean() <= 1
+    assert splats.log_scales.exp().median() < (splats.means.amax(0) - splats.means.amin(0)).max()
