@@ -1,14 +1,16 @@
 """Rendering a decoded file: time to load, time of a frame by part, memory against the size of the decoded model.
 
-    python benchmarks/rendering.py [--anchors 50000 | --file scene.cgs --scene capture] [--threads 2] [--output f.json]
+    python benchmarks/rendering.py [--anchors 50000 300000 | --file scene.cgs --scene capture] [--threads 2]
+        [--output f.json]
 
-Without a file, a made-up scene is encoded first: anchors on surfaces, random embeddings, four of five coupled
-primitives kept. With one, `--scene` is the capture whose held-out views are rendered, at their own size. Decoding and
-rendering are processes of their own; both handle a tiny file first, so that neither time nor memory is that of
-loading kernels.
+Without a file, made-up scenes are encoded first: anchors on surfaces, random embeddings, four of five coupled
+primitives kept. With one, `--scene` is the capture whose held-out views are rendered, at their own size, also with the
+networks of opacity and color in half precision. Decoding and rendering are processes of their own; both handle a tiny
+file first, so that neither time nor memory is that of loading kernels.
 """
 
 import argparse
+import importlib
 import json
 import os
 import platform
@@ -18,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +28,50 @@ import compgs  # noqa: F401  # before torch: its threads must not spin
 
 TINY = 200  # anchors
 KEPT = 0.8  # share of coupled primitives that exist
+# Where a frame's time goes: part, module and function.
+PARTS = (
+    ("culling", "compgs.render.render_model", "visible_mask"),
+    ("networks", "compgs.model.hybrid_model", "predict_appearance"),
+    ("gathering what is drawn", "compgs.model.hybrid_model", "gather_drawn"),
+    ("projection", "compgs.render.numba_backend", "project_forward"),
+    ("binning: tiles of each splat", "compgs.render.numba_backend", "pack_splats"),
+    ("binning: lists of each tile", "compgs.render.numba_backend", "list_tiles"),
+    ("blending", "compgs.render.numba_backend", "blend"),
+)
 
 
 def timed(function: Callable[[], Any]) -> tuple[float, Any]:
     start = time.perf_counter()
     result = function()
     return time.perf_counter() - start, result
+
+
+class Stopwatch:
+    """Milliseconds of some functions of a module's namespace, from call to return."""
+
+    def __init__(self) -> None:
+        self.ms: dict[str, list[float]] = {}
+        for part, module, name in PARTS:
+            place = importlib.import_module(module)
+            setattr(place, name, self.around(part, getattr(place, name)))
+
+    def around(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        times = self.ms[part] = []
+
+        def measured(*args: Any, **kwargs: Any) -> Any:
+            seconds, result = timed(lambda: function(*args, **kwargs))
+            times.append(1e3 * seconds)
+            return result
+
+        return measured
+
+    def clear(self) -> None:
+        for times in self.ms.values():
+            times.clear()
+
+
+def median(values: list[float]) -> float:
+    return sorted(values)[len(values) // 2]
 
 
 def peak_mb() -> float:
@@ -96,7 +137,7 @@ def render(options: argparse.Namespace) -> dict[str, Any]:
     import torch
 
     from compgs.codec.decoder import decode
-    from compgs.render import RasterSettings, rasterize, render, visible_mask
+    from compgs.render import RasterSettings, render, visible_mask
 
     torch.set_num_threads(options.threads)
     numba.set_num_threads(options.threads)
@@ -107,25 +148,20 @@ def render(options: argparse.Namespace) -> dict[str, Any]:
     decoding = peak_mb()
     geometry, _ = timed(lambda: model.bounds)
     first, _ = timed(lambda: render(model, views[0]))
-    settings = RasterSettings(background=model.background)
-    parts: dict[str, list[float]] = {"frame": [], "culling": [], "opacity and color": [], "rasterization": []}
-    shares, drawn = [], []
+    frames: list[float] = []
     processor = time.process_time()
     for i in range(options.frames):
-        parts["frame"].append(timed(lambda: render(model, views[i % len(views)]))[0])  # noqa: B023
+        frames.append(timed(lambda: render(model, views[i % len(views)]))[0])  # noqa: B023
     processor = time.process_time() - processor
     growth = peak_mb() - before
+    watch = Stopwatch()
     for i in range(options.frames):
-        camera = views[i % len(views)]
-        with torch.no_grad():
-            t, visible = timed(lambda: visible_mask(*model.bounds, camera, settings))  # noqa: B023
-            parts["culling"].append(t)
-            t, gaussians = timed(lambda: model.gaussians(camera, visible))  # noqa: B023
-            parts["opacity and color"].append(t)
-            t, _ = timed(lambda: rasterize(gaussians, camera, settings))  # noqa: B023
-            parts["rasterization"].append(t)
+        render(model, views[i % len(views)])
+    shares, drawn = [], []
+    for view in views:
+        visible = visible_mask(*model.bounds, view, RasterSettings())
         shares.append(float(visible.float().mean()))
-        drawn.append(len(gaussians.means))
+        drawn.append(len(model.gaussians(view, visible)))
     geometry_mb = megabytes(*model.geometry, *model.bounds[1:])
     return {
         "anchors": model.anchors,
@@ -138,9 +174,10 @@ def render(options: argparse.Namespace) -> dict[str, Any]:
         "load_s": load,
         "geometry_s": geometry,
         "first_frame_s": first,
-        "ms": {name: 1e3 * sorted(values)[len(values) // 2] for name, values in parts.items()},
+        "frame_ms": 1e3 * median(frames),
+        "parts_ms": {part: median(times[: options.frames]) for part, times in watch.ms.items() if times},
         "cpu_ms": 1e3 * processor / options.frames,
-        "frames_per_second": options.frames / sum(parts["frame"]),
+        "frames_per_second": options.frames / sum(frames),
         "model_mb": model_mb(model),
         "geometry_mb": geometry_mb,
         "decoding_growth_mb": decoding - before,
@@ -148,7 +185,26 @@ def render(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-JOBS = {"make": make, "decode": decode, "render": render}
+def precision(options: argparse.Namespace) -> dict[str, Any]:
+    """PSNR of the held-out views by the type in which the networks of opacity and color compute."""
+    import torch
+
+    from compgs.codec.decoder import decode
+    from compgs.metrics import psnr, to_8bit
+    from compgs.render import render
+    from compgs.scene import load_scene
+
+    views = load_scene(options.scene, downscale=options.downscale).test_views
+    model = decode(options.file)
+    found = {}
+    for dtype in (torch.float32, torch.bfloat16, torch.float16):
+        rough = replace(model, appearance_dtype=dtype)
+        values = [psnr(to_8bit(render(rough, v.camera).image), v.image) for v in views]
+        found[str(dtype).removeprefix("torch.")] = sum(values) / len(values)
+    return found
+
+
+JOBS = {"make": make, "decode": decode, "render": render, "precision": precision}
 
 
 def child(job: str, options: argparse.Namespace, **changed: Any) -> dict[str, Any]:
@@ -171,20 +227,29 @@ def report(results: dict[str, Any]) -> None:
         f"\ndecoding {r['load_s']:.2f} s, geometry {r['geometry_s']:.2f} s, first frame {r['first_frame_s']:.2f} s"
     )
     print(f"**{r['frames_per_second']:.1f} frames a second**\n\n| part | ms |\n|---|---|")
-    for name, value in r["ms"].items():
+    print(f"| frame, median | {r['frame_ms']:.1f} |")
+    for name, value in r["parts_ms"].items():
         print(f"| {name} | {value:.1f} |")
     print(f"| processor time of a frame | {r['cpu_ms']:.1f} |")
     whole = r["model_mb"] + r["geometry_mb"]
-    print("\n| | of it kept, MB | peak growth, MB | ratio |\n|---|---|---|---|")
+    print("\n| | decoded model, MB | peak growth, MB | ratio |\n|---|---|---|---|")
     print(f"| decoding | {d['model_mb']:.1f} | {d['growth_mb']:.1f} | {d['growth_mb'] / d['model_mb']:.2f} |")
-    print(f"| decoding and rendering | {whole:.1f} | {r['growth_mb']:.1f} | {r['growth_mb'] / whole:.2f} |")
+    print(
+        f"| decoding and rendering (with geometry) | {whole:.1f} | {r['growth_mb']:.1f} | "
+        f"{r['growth_mb'] / whole:.2f} |"
+    )
+    if "precision" in results:
+        print("\n| opacity and color in | PSNR, dB |\n|---|---|")
+        for dtype, value in results["precision"].items():
+            print(f"| {dtype} | {value:.4f} |")
+    print()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--anchors", type=int, default=50_000)
+    parser.add_argument("--anchors", type=int, nargs="+", default=[50_000])
     parser.add_argument("--file", type=Path)
     parser.add_argument("--scene", type=Path)
     parser.add_argument("--downscale", type=int, default=1, help="of the capture's images")
@@ -197,6 +262,7 @@ def main() -> None:
     parser.add_argument("--job", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.job:
+        options.anchors = options.anchors[0]
         print(json.dumps(JOBS[options.job](options)))
         return
     if options.file and not options.scene:
@@ -204,18 +270,18 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         options.tiny = Path(folder) / "tiny.cgs"
         child("make", options, anchors=TINY, file=options.tiny, scene=None)
-        if not options.file:
-            options.file = Path(folder) / "made.cgs"
-            child("make", options)
-        results: dict[str, Any] = {job: child(job, options) for job in ("decode", "render")}
-    results["machine"] = {
-        "cores": os.cpu_count(),
-        "threads": options.threads,
-        "python": platform.python_version(),
-    }
-    report(results)
+        machine = {"cores": os.cpu_count(), "threads": options.threads, "python": platform.python_version()}
+        every = []
+        for anchors in [None] if options.file else options.anchors:
+            file = options.file or Path(folder) / f"{anchors}.cgs"
+            if not options.file:
+                child("make", options, anchors=anchors, file=file)
+            jobs = ["decode", "render", *(["precision"] if options.file else [])]
+            results: dict[str, Any] = {job: child(job, options, anchors=anchors, file=file) for job in jobs}
+            every.append(results | {"machine": machine})
+            report(every[-1])
     if options.output:
-        options.output.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+        options.output.write_text(json.dumps(every, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -93,6 +93,12 @@ class TrainingConfig:
     quantized_weights: float = (
         0.8  # of the steps before the networks' weights are trained as they will be stored
     )
+    sparse_adam: bool = (
+        False  # Adam moves, and lets decay the moments of, only the anchors in view (Taming 3DGS)
+    )
+    appearance_dtype: Literal["float32", "bfloat16"] = (
+        "float32"  # in which the networks of opacity and color compute; bfloat16 is meant for GPUs
+    )
     checkpoint_minutes: float = (
         5.0  # between two checkpoints; one is also written when the run is interrupted
     )
@@ -195,6 +201,8 @@ def check_config(config: Config) -> None:
         ("training.scale_weight", 0 <= t.scale_weight < 1e6, "0 or more"),
         ("training.quantized_weights", 0 <= t.quantized_weights <= 1, "0 to 1"),
         ("training.head_warm_up", 0 <= t.head_warm_up <= 1, "0 to 1"),
+        ("training.sparse_adam", isinstance(t.sparse_adam, bool), "true or false"),
+        ("training.appearance_dtype", t.appearance_dtype in ("float32", "bfloat16"), "float32 or bfloat16"),
         ("training.checkpoint_minutes", 0 < t.checkpoint_minutes < 1e6, "above 0"),
         ("control.start", 0 <= c.start <= 1, "0 to 1"),
         ("control.stop", 0 <= c.stop <= 1, "0 to 1"),

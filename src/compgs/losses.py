@@ -82,9 +82,14 @@ class _FusedPhotometric(torch.autograd.Function):
         return gradient * grads[0], None, None
 
 
-def scale_regularizer(scales: Tensor) -> Tensor:
-    """Mean product of the three scales, [M, 3] world units: large primitives are expensive to render."""
-    return scales.prod(1).sum() / max(1, len(scales))  # (a view may see none)
+def scale_regularizer(scales: Tensor, drawn: Tensor | None = None) -> Tensor:
+    """Mean product of the three scales, [M, 3] world units, of those that are drawn ([M] bool; None: all): large
+    primitives are expensive to render.
+    """
+    # (a view may see none)
+    if drawn is None:
+        return scales.prod(1).sum() / max(1, len(scales))
+    return (scales.prod(1) * drawn).sum() / drawn.sum().clamp_min(1)
 
 
 def revival_loss(opacities: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ local covariance:
     SSIM = (2 m n + C1) (2 c + C2) / ((m^2 + n^2 + C1) (v + w + C2)),    averaged over pixels and channels
 """
 
+import functools
 import math
 
 import numpy as np
@@ -27,9 +28,15 @@ def window() -> np.ndarray:
     return weight / weight.sum()
 
 
+@functools.lru_cache(maxsize=16)
+def window_on(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`window` on a device; kept, as a copy to a GPU waits for it to finish its work."""
+    return torch.as_tensor(window(), dtype=dtype, device=device)
+
+
 def ssim(x: Tensor, y: Tensor) -> Tensor:
     """Mean SSIM of [H, W, 3] images: plain torch, any device and type."""
-    taps = torch.as_tensor(window(), dtype=x.dtype, device=x.device)
+    taps = window_on(x.dtype, x.device)
 
     def blur(maps: Tensor) -> Tensor:  # [N, 1, H, W]
         maps = torch.nn.functional.conv2d(maps, taps.view(1, 1, -1, 1), padding=(WINDOW_SIZE // 2, 0))

@@ -1,28 +1,45 @@
 """Sorting and tile lists against brute force."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from compgs.render.binning import TILE_HEIGHT, TILE_WIDTH, TileLists, bin_splats, sort_by_key
+from compgs.render.binning import FEW, TILE_HEIGHT, TILE_WIDTH, TileLists, bin_splats, sort_tiles
 from compgs.render.settings import RasterSettings
 
 WIDTH, HEIGHT = 45, 70
 
 
+def sorted_tiles(keys: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    order = np.empty(len(keys), np.int32)
+    sort_tiles(starts, keys, order)
+    return order
+
+
 @settings(max_examples=60, deadline=None)
-@given(hnp.arrays(np.uint32, st.integers(0, 300), elements=st.integers(0, 2**32 - 1)))
-def test_radix_sort_is_a_stable_sort(keys):
-    order = np.arange(len(keys), dtype=np.int32)
-    assert np.array_equal(sort_by_key(keys, order), np.argsort(keys, kind="stable"))
+@given(
+    hnp.arrays(np.uint32, st.integers(0, 300), elements=st.integers(0, 2**32 - 1)),
+    st.lists(st.integers(0, 300), max_size=20),
+)
+def test_each_tile_is_sorted_stably_and_by_itself(keys, cuts):
+    starts = np.array([0, *sorted(min(c, len(keys)) for c in cuts), len(keys)])
+    expected = [
+        begin + np.argsort(keys[begin:end], kind="stable") for begin, end in itertools.pairwise(starts)
+    ]
+    assert np.array_equal(sorted_tiles(keys, starts), np.concatenate(expected))
 
 
-def test_radix_sort_keeps_the_order_of_equal_keys():
-    keys = np.random.default_rng(0).integers(7, 12, 5000).astype(np.uint32)
-    order = np.arange(5000, dtype=np.int32)
-    assert np.array_equal(sort_by_key(keys, order), np.argsort(keys, kind="stable"))
+@pytest.mark.parametrize("count", [1, FEW, FEW + 1, 5000])
+@pytest.mark.parametrize("most", [8, 300, 2**32])
+def test_sorting_keeps_the_order_of_equal_keys(count, most):
+    keys = np.random.default_rng(0).integers(7, most, count).astype(np.uint32)
+    keys[count // 2 :] = keys[: count - count // 2]
+    starts = np.array([0, count])
+    assert np.array_equal(sorted_tiles(keys, starts), np.argsort(keys, kind="stable"))
 
 
 def make_splats(seed: int, count: int = 60) -> dict[str, np.ndarray]:
@@ -75,7 +92,9 @@ def test_entries_of_a_tile_go_front_to_back_and_slots_find_them():
     splats = make_splats(1, 500)
     lists = bin_splats(**splats, width=WIDTH, height=HEIGHT, settings=RasterSettings())
     for tile in range(len(lists.starts) - 1):
-        depths = splats["depths"][lists.entries[lists.starts[tile] : lists.starts[tile + 1], 0]]
+        entries = lists.order[lists.starts[tile] : lists.starts[tile + 1]]
+        assert np.array_equal(np.sort(entries), np.arange(lists.starts[tile], lists.starts[tile + 1]))
+        depths = splats["depths"][lists.entries[entries, 0]]
         assert np.all(np.diff(depths) >= 0)
     for i in np.nonzero(lists.visible)[0]:
         slots = lists.slots[lists.first_slot[i] : lists.first_slot[i] + lists.slots_used[i]]

@@ -16,8 +16,11 @@ LIMITS = (float32, float32, float32)
 KERNELS = {
     "project_forward": (projection, (F2, F2, F2, F1, F2, F2, F1, F1)),
     "project_backward": (projection, (F2, F2, F2, F1, F1, F2, F2, F2, F2, F2)),
-    "blend_forward": (tiles, (F2, int64[::1], int32[:, ::1], F1, *LIMITS, F3, F2, int64[::1])),
-    "blend_backward": (tiles, (F2, int64[::1], int32[:, ::1], int64[::1], *LIMITS, F3, F2, F3, F2, F2)),
+    "blend_forward": (tiles, (F2, int64[::1], int32[:, ::1], int32[::1], F1, *LIMITS, F3, F2, int64[::1])),
+    "blend_backward": (
+        tiles,
+        (F2, int64[::1], int32[:, ::1], int32[::1], int64[::1], *LIMITS, F3, F2, F3, F2, F2),
+    ),
 }
 # mul, fma and their variants; "ps" is packed, "ss" scalar
 PACKED = re.compile(r"^\s*v?f?n?m(?:ul|add\d*|sub\d*)ps\s", re.MULTILINE)

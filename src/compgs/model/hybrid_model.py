@@ -4,18 +4,30 @@ import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.model.prediction import OPACITY_CUTOFF, PredictionHeads, affine_transform, view_embedding
+from compgs.model.appearance import block_count, gather_drawn, predict_appearance
+from compgs.model.layers import MLPArrays
+from compgs.model.prediction import (
+    OPACITY_CUTOFF,
+    PredictionHeads,
+    affine_transform,
+    appearance_precision,
+    camera_center,
+    choosing_pays,
+    view_embedding,
+)
 from compgs.model.primitives import Primitives
 
 # An opaque splat falls below 1/255 at sqrt(2 ln 255) = 3.33 standard deviations.
 CUTOFF_SIGMAS = 3.34
 # Anchors are worked on in blocks, so that memory stays near the size of the result.
 BLOCK = 1 << 14
+GPU_BLOCK = 1 << 18  # a GPU is not busy with fewer
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +42,9 @@ class HybridModel:
     heads: PredictionHeads
     distance_unit: float  # world units, of the view embedding
     background: tuple[float, float, float]  # RGB, 0 to 1
+    appearance_dtype: torch.dtype = (
+        torch.float32
+    )  # in which opacity and color are computed; bfloat16: for GPUs
 
     @property
     def anchors(self) -> int:
@@ -90,14 +105,71 @@ class HybridModel:
     def gaussians(self, camera: Camera, visible: Tensor | None = None) -> Gaussians:
         """What a camera sees. `visible` [N] bool: anchors to look at; all of them if not given."""
         p = self.primitives
-        center = torch.as_tensor(camera.center, dtype=p.positions.dtype, device=p.positions.device)
+        center = camera_center(camera, p.positions.device).to(p.positions.dtype)
         if visible is None:
             chosen = torch.arange(len(p), device=p.positions.device)
         else:
             chosen = torch.nonzero(visible).view(-1)
-        parts = [self._appearance(anchors, center) for anchors in chosen.split(BLOCK)]
+        if self._fused:
+            return self._fused_gaussians(chosen, center)
+        blocks = chosen.split(GPU_BLOCK if chosen.is_cuda else BLOCK)
+        parts = [self._appearance(anchors, center) for anchors in blocks]
         drawn, opacities, colors = (torch.cat(part) for part in zip(*parts, strict=True))
         means, scales, quaternions = (array.index_select(0, drawn) for array in self.geometry)
+        return Gaussians(means, quaternions, scales, opacities, colors)
+
+    @property
+    def _fused(self) -> bool:
+        """Whether the kernels of `appearance` do it."""
+        plain = self.primitives.residuals.dtype == self.appearance_dtype == torch.float32
+        return plain and self.primitives.residuals.device.type == "cpu" and self.heads.layout == "paired"
+
+    @functools.cached_property
+    def _appearance_arrays(self) -> MLPArrays:
+        return self.heads.appearance.arrays()
+
+    def _fused_gaussians(
+        self,
+        anchors: Tensor,  # [V] int64, ascending
+        center: Tensor,  # [3] of the camera, world units
+    ) -> Gaussians:
+        """What `_appearance` and gathers of the geometry give, by compiled kernels."""
+        p, first = self.primitives, self.first_coupled
+        counts = first.index_select(0, anchors + 1) - first.index_select(0, anchors)
+        places = nn.functional.pad(counts.cumsum(0), (1, 0))
+        appearance = np.empty((int(places[-1]), 4), np.float32)
+        drawn = np.zeros(block_count(len(anchors)), np.int64)
+        where = anchors.numpy(), first.numpy(), places.numpy()
+        predict_appearance(
+            *where,
+            p.positions.contiguous().numpy(),
+            p.references.contiguous().numpy(),
+            p.residuals.contiguous().numpy(),
+            center.numpy(),
+            np.float32(self.distance_unit),
+            np.float32(OPACITY_CUTOFF),
+            *self._appearance_arrays,
+            appearance,
+            drawn,
+        )
+        offsets = np.concatenate([[0], np.cumsum(drawn)])
+        m = int(offsets[-1])
+        means, scales, quaternions, colors = (p.positions.new_empty(m, size) for size in (3, 3, 4, 3))
+        opacities = p.positions.new_empty(m)
+        all_means, all_scales, all_quaternions = (t.numpy() for t in self.geometry)
+        gather_drawn(
+            *where,
+            appearance,
+            offsets,
+            all_means,
+            all_scales,
+            all_quaternions,
+            means.numpy(),
+            scales.numpy(),
+            quaternions.numpy(),
+            opacities.numpy(),
+            colors.numpy(),
+        )
         return Gaussians(means, quaternions, scales, opacities, colors)
 
     def _appearance(
@@ -105,7 +177,10 @@ class HybridModel:
         anchors: Tensor,  # [V] int64, ascending
         center: Tensor,  # [3] of the camera, world units
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the anchors' coupled primitives that are drawn: which they are [M], opacities [M], colors [M, 3]."""
+        """Of the anchors' coupled primitives that are drawn: which they are [M], opacities [M], colors [M, 3].
+
+        On a GPU all of them, those that are not drawn with opacity 0.
+        """
         p = self.primitives
         first = self.first_coupled.index_select(0, anchors)
         counts = self.first_coupled.index_select(0, anchors + 1) - first
@@ -116,11 +191,22 @@ class HybridModel:
         view = view_embedding(p.positions.index_select(0, anchors), center, self.distance_unit)
         seen = torch.cat([p.references.index_select(0, anchors), view], 1)
         residuals = p.residuals.index_select(0, coupled)
-        raw = self.heads("appearance", seen, residuals, rows)
+        raw = self._head("appearance", seen, residuals, rows)
         opacities = torch.tanh(raw[:, 0])
+        if not choosing_pays(rows.device):
+            shown = torch.where(opacities > OPACITY_CUTOFF, opacities, torch.zeros_like(opacities))
+            if self.heads.layout == "paired":
+                color = raw[:, 1:4]
+            else:
+                color = self._head("color", seen, residuals, rows)
+            return coupled, shown, torch.sigmoid(color)
         drawn = torch.nonzero(opacities > OPACITY_CUTOFF).view(-1)
         if self.heads.layout == "paired":
             color = raw.index_select(0, drawn)[:, 1:4]
         else:
-            color = self.heads("color", seen, residuals.index_select(0, drawn), rows.index_select(0, drawn))
+            color = self._head("color", seen, residuals.index_select(0, drawn), rows.index_select(0, drawn))
         return coupled.index_select(0, drawn), opacities.index_select(0, drawn), torch.sigmoid(color)
+
+    def _head(self, kind: str, seen: Tensor, residuals: Tensor, rows: Tensor) -> Tensor:
+        with appearance_precision(residuals.device, self.appearance_dtype):
+            return self.heads(kind, seen, residuals, rows).to(residuals.dtype)

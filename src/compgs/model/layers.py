@@ -62,22 +62,34 @@ class ResidualMLP(nn.Module):
         residuals: Tensor,  # [M, residual_dim]
         anchor_index: Tensor,  # [M] int64, ascending: row of anchor_features of each coupled primitive
     ) -> Tensor:  # [M, outputs]
-        # First layer and skip side by side: [inputs, width + outputs].
-        entry = torch.cat([self.input_weight, self.skip_weight], 1)
-        bias = torch.cat([self.input_bias, self.output_bias])
-        shared = torch.addmm(bias, anchor_features, entry[: self.anchor_dim])
-        entry = entry[self.anchor_dim :]
-        if residuals.device.type == "cpu" and residuals.dtype == torch.float32:
-            weights = [entry, *(p for block in self.blocks for p in block.parameters()), self.output_weight]
-            return _FusedMLP.apply(shared, residuals, anchor_index, *weights)
-        first = torch.addmm(shared.index_select(0, anchor_index), residuals, entry)
+        anchor_entry, entry, bias = self._entry()
+        shared = torch.addmm(bias, anchor_features, anchor_entry)
+        if shared.device.type == "cpu" and shared.dtype == residuals.dtype == torch.float32:
+            return _FusedMLP.apply(shared, residuals, anchor_index, *self._after_entry(entry))
+        first = torch.addmm(shared.index_select(0, anchor_index), residuals, entry)  # float16 under autocast
         x = nn.functional.leaky_relu(first[:, : self.width], NEGATIVE_SLOPE)
         for block in self.blocks:
             x = block(x)
         return torch.addmm(first[:, self.width :], x, self.output_weight)
 
+    def arrays(self) -> "MLPArrays":
+        """A, bias [H + O] of the anchor's part, then R, V1, a1, V2, a2, U of `residual_mlp`: copies, in float32."""
+        anchor_entry, entry, bias = (t.detach() for t in self._entry())
+        return anchor_entry.numpy(), bias.numpy(), *_arrays(tuple(self._after_entry(entry)))
+
+    def _entry(self) -> tuple[Tensor, Tensor, Tensor]:
+        """First layer and skip side by side: of the anchor, of the residual [inputs, width + outputs]; bias."""
+        entry = torch.cat([self.input_weight, self.skip_weight], 1)
+        bias = torch.cat([self.input_bias, self.output_bias])
+        return entry[: self.anchor_dim], entry[self.anchor_dim :], bias
+
+    def _after_entry(self, entry: Tensor) -> list[Tensor]:
+        """Weights of `_FusedMLP`."""
+        return [entry, *(p for block in self.blocks for p in block.parameters()), self.output_weight]
+
 
 _A = np.ndarray
+MLPArrays = tuple[_A, _A, _A, _A, _A, _A, _A, _A]
 
 
 def _arrays(weights: tuple[Tensor, ...]) -> tuple[_A, _A, _A, _A, _A, _A]:

@@ -9,11 +9,15 @@ are either separate, or paired into one for geometry and one for appearance, whi
 Opacity is predicted first: a coupled primitive that is not seen needs nothing else.
 """
 
+import contextlib
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.model.fused import AffineTransform, SelectVisible
 from compgs.model.layers import ResidualMLP
@@ -70,6 +74,13 @@ class Prediction:
     gaussians: Gaussians  # M primitives
     index: Tensor  # [M] int64, ascending: which coupled primitives (of P) they are
     opacities: Tensor  # [P] of all coupled primitives; not above 0: not drawn
+    drawn: Tensor | None = None  # [M] bool: those that are drawn, of opacity above 0; None: all M
+
+
+@functools.lru_cache(maxsize=4096)
+def camera_center(camera: Camera, device: torch.device) -> Tensor:
+    """[3] float32, world units; kept, as a copy to a GPU waits for it to finish its work."""
+    return torch.tensor(camera.center, dtype=torch.float32, device=device)
 
 
 def view_embedding(positions: Tensor, camera_center: Tensor, distance_unit: float) -> Tensor:
@@ -93,8 +104,21 @@ def affine_transform(
     means = positions + raw[:, :3] * offset_scales
     scales = torch.sigmoid(raw[:, 3:6]) * sizes
     # An identity offset keeps the norm away from zero, where the direction has no gradient.
-    identity = raw.new_tensor([1.0, 0.0, 0.0, 0.0])
-    return means, scales, raw[:, 6:10] + identity
+    return means, scales, torch.cat([raw[:, 6:7] + 1.0, raw[:, 7:10]], 1)
+
+
+def choosing_pays(device: torch.device) -> bool:
+    """Whether to leave out primitives that are not drawn: not where their number must first come from a GPU."""
+    return device.type != "cuda"
+
+
+def appearance_precision(
+    device: torch.device, dtype: torch.dtype
+) -> contextlib.AbstractContextManager[object]:
+    """Within it, the networks of opacity and color compute in `dtype` (float32: as always)."""
+    if dtype == torch.float32:
+        return contextlib.nullcontext()
+    return torch.autocast(device.type, dtype=dtype, cache_enabled=False)
 
 
 def predict(
@@ -103,21 +127,30 @@ def predict(
     camera_center: Tensor,  # [3] world units
     distance_unit: float,  # world units
     weights: dict[str, Tensor] | None = None,
+    *,
+    compact: bool = True,
+    appearance_dtype: torch.dtype = torch.float32,
 ) -> Prediction:
     """Gaussians of all coupled primitives that can be seen from a camera (Sec. 3.2).
 
-    `weights`: other parameter values for the heads (as they will be stored), by name.
+    `weights`: other parameter values for the heads (as they will be stored), by name. Not `compact`: all coupled
+    primitives, those that are not drawn with opacity 0; the same image and gradients by more arithmetic, but a GPU need
+    not be waited for to learn how many there are. `appearance_dtype`: of the networks of opacity and color.
     """
 
     def call(kind: str, anchors: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
-        if weights is None:
-            return heads(kind, anchors, residuals, index)
-        return torch.func.functional_call(heads, weights, (kind, anchors, residuals, index))
+        dtype = torch.float32 if kind == "geometry" else appearance_dtype
+        with appearance_precision(residuals.device, dtype):
+            if weights is None:
+                raw = heads(kind, anchors, residuals, index)
+            else:
+                raw = torch.func.functional_call(heads, weights, (kind, anchors, residuals, index))
+        return raw.to(residuals.dtype)
 
     view = view_embedding(primitives.positions, camera_center, distance_unit)
     seen = torch.cat([primitives.references, view], 1)
     raw = call("appearance", seen, primitives.residuals, primitives.anchor_index)
-    if heads.layout == "paired" and raw.device.type == "cpu" and raw.dtype == torch.float32:
+    if compact and heads.layout == "paired" and raw.device.type == "cpu" and raw.dtype == torch.float32:
         drawn, colors, residuals, index, opacities = SelectVisible.apply(
             raw, primitives.residuals, OPACITY_CUTOFF
         )
@@ -128,6 +161,8 @@ def predict(
         )
         return Prediction(Gaussians(means, quaternions, scales, drawn, colors), index, opacities)
     opacities = torch.tanh(raw[:, 0])
+    if not compact:
+        return _predict_all(heads, primitives, call, seen, raw, opacities)
     index = torch.nonzero(opacities.detach() > OPACITY_CUTOFF).view(-1)
     anchor = primitives.anchor_index[index]
     residuals = primitives.residuals.index_select(0, index)
@@ -143,3 +178,27 @@ def predict(
     )
     gaussians = Gaussians(means, quaternions, scales, opacities.index_select(0, index), torch.sigmoid(color))
     return Prediction(gaussians, index, opacities)
+
+
+def _predict_all(
+    heads: PredictionHeads,
+    primitives: Primitives,
+    call: Callable[[str, Tensor, Tensor, Tensor], Tensor],
+    seen: Tensor,
+    raw: Tensor,
+    opacities: Tensor,
+) -> Prediction:
+    """The rest of `predict` where nothing is left out."""
+    p, anchor = primitives, primitives.anchor_index
+    drawn = opacities.detach() > OPACITY_CUTOFF
+    color = raw[:, 1:4] if heads.layout == "paired" else call("color", seen, p.residuals, anchor)
+    means, scales, quaternions = affine_transform(
+        call("geometry", p.references, p.residuals, anchor),
+        p.positions.index_select(0, anchor),
+        p.offset_scales.index_select(0, anchor),
+        p.sizes.index_select(0, anchor),
+    )
+    shown = torch.where(drawn, opacities, torch.zeros_like(opacities))
+    gaussians = Gaussians(means, quaternions, scales, shown, torch.sigmoid(color))
+    index = torch.arange(len(opacities), device=opacities.device)
+    return Prediction(gaussians, index, opacities, drawn)

@@ -64,7 +64,7 @@ def _add_rows(total, d, rows):
 
 
 @njit(fastmath=_FASTMATH, cache=True)
-def _activations(residuals, index, shared, R, V1, a1, V2, a2, first, x, h):
+def activations(residuals, index, shared, R, V1, a1, V2, a2, first, x, h):
     """One group: fills first [n, H + O], x [blocks + 1, ROWS, H] and h [blocks, ROWS, H]."""
     n, H = residuals.shape[0], V1.shape[2]
     np.dot(residuals, R, first)
@@ -108,7 +108,7 @@ def forward(
         for g in range(groups * t // tasks, groups * (t + 1) // tasks):
             p, q = g * ROWS, min(M, (g + 1) * ROWS)
             n = q - p
-            _activations(residuals[p:q], index[p:q], shared, R, V1, a1, V2, a2, first[:n], x, h)
+            activations(residuals[p:q], index[p:q], shared, R, V1, a1, V2, a2, first[:n], x, h)
             np.dot(x[blocks, :n], U, out[p:q])
             for i in range(n):
                 for j in range(O):
@@ -171,7 +171,7 @@ def backward(
         for p in range(bounds[c], bounds[c + 1], ROWS):
             q = min(bounds[c + 1], p + ROWS)
             n = q - p
-            _activations(residuals[p:q], index[p:q], shared, R, V1, a1, V2, a2, first[:n], x, h)
+            activations(residuals[p:q], index[p:q], shared, R, V1, a1, V2, a2, first[:n], x, h)
             d = d_out[p:q]
             np.dot(d, U_t, dx[:n])
             at = G * F + blocks * 2 * (H * H + H)

@@ -1,13 +1,14 @@
 """Which splats touch which tiles, in depth order (CPU).
 
-    box meets image? ──► visible ─┬─ ellipse against columns ──► slots (a splat's tiles, rows) ─┐
-                                  └─ radix sort ──► depth order ────────────────────────────────┴──► entries
+    box meets image? ──► visible ──► ellipse against columns ──► slots (a splat's tiles, rows)
+                                  ──► counting sort by tile ──► entries ──► radix sort of each tile ──► order
 
-One depth sort; a stable counting sort by tile then leaves every tile's entries in depth order. An image
-column of TILE_WIDTH pixels is cut by a splat's ellipse in an interval of rows that is known in closed form,
-so a tile's entry holds exactly the rows in which alpha may reach the cutoff. All that is computed per splat
-is computed, and stays, in the order of the input, whose neighbours are mostly neighbours in the image. Work
-is cut into CHUNKS pieces whatever the number of threads.
+An image column of TILE_WIDTH pixels is cut by a splat's ellipse in an interval of rows that is known in closed
+form, so a tile's entry holds exactly the rows in which alpha may reach the cutoff. All that is computed per
+splat is computed, and stays, in the order of the input, whose neighbours are mostly neighbours in the image.
+Tiles are sorted by depth one by one, within a core's cache: one sort of all splats before they are handed out
+to tiles would read them in an order that no cache can follow (twice the time). Both sorts are stable: splats of
+equal depth stay in the order of the input. Work is cut into CHUNKS pieces whatever the number of threads.
 """
 
 import math
@@ -22,7 +23,12 @@ TILE_WIDTH = 8  # pixels
 TILE_HEIGHT = 32  # pixels
 CHUNKS = 16
 PARAMETERS = 9  # of a packed splat
-RADIX_BITS = 11
+TILE_X_BITS, TILE_Y_BITS = 3, 5  # shifts, not divisions: those of signed numbers are slow
+RADIX_BITS = 8
+RADIX = 1 << RADIX_BITS
+DIGITS = 4  # of a depth key
+FEW = 32  # entries that are sorted by insertion: counting 256 digits costs more
+STRIDE = 16  # tiles; threads get runs of turns, and a run of neighbouring tiles may hold most of the splats
 MOST_SLOTS = 1 << 28  # of all splats together; beyond it memory, not time, would run out
 
 # No "nnan", "ninf": comparisons with NaN decide what is visible.
@@ -38,18 +44,50 @@ EXP2_SCALE = f32(math.sqrt(0.5 / math.log(2)))
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """E entries sorted by tile, front to back within a tile. Rows of invisible splats are not set."""
+    """E entries sorted by tile, and their order front to back. Rows of invisible splats are not set."""
 
     visible: np.ndarray  # [M] bool
     packed: np.ndarray  # [M, PARAMETERS] float32: mean x, y; Cholesky l00, l10, l11; log2 opacity; R, G, B
     starts: np.ndarray  # [tiles + 1] int64: first entry of each tile, row by row
     entries: np.ndarray  # [E, 2] int32: splat; first and last row within the tile (first * 256 + last)
+    order: np.ndarray  # [E] int32: the entries of each tile, front to back
     first_slot: np.ndarray  # [M] int32
     slots_used: np.ndarray  # [M] int32
     slots: np.ndarray  # [..] int32: the splats' entries, splat by splat (with gaps)
 
 
+@dataclass(frozen=True, eq=False)
+class PackedSplats:
+    """M splats as blending reads them, and the tiles that each one touches. Rows of invisible splats are not set."""
+
+    visible: np.ndarray  # [M] bool
+    packed: np.ndarray  # [M, PARAMETERS] float32
+    first_slot: np.ndarray  # [M] int32
+    slots_used: np.ndarray  # [M] int32
+    slots: np.ndarray  # [..] int32: tiles, splat by splat (with gaps)
+    rows: np.ndarray  # [..] uint16: first and last row within the tile (first * 256 + last)
+    counts: np.ndarray  # [CHUNKS, tiles] int64: slots of each chunk of splats, by tile
+
+
 def bin_splats(
+    means2d: np.ndarray,
+    covariances: np.ndarray,
+    determinants: np.ndarray,
+    depths: np.ndarray,
+    opacities: np.ndarray,
+    colors: np.ndarray,
+    width: int,
+    height: int,
+    settings: RasterSettings,
+) -> TileLists:
+    """The lists of all tiles; arguments as those of `pack_splats`."""
+    splats = pack_splats(
+        means2d, covariances, determinants, depths, opacities, colors, width, height, settings
+    )
+    return list_tiles(splats, depths)
+
+
+def pack_splats(
     means2d: np.ndarray,  # [M, 2] pixels
     covariances: np.ndarray,  # [M, 3] pixels^2
     determinants: np.ndarray,  # [M] pixels^4
@@ -59,13 +97,20 @@ def bin_splats(
     width: int,
     height: int,
     settings: RasterSettings,
-) -> TileLists:
-    """The lists of all tiles. Raises MemoryError for splats that would need absurd amounts of it."""
+    packed: np.ndarray | None = None,  # [M, PARAMETERS] to be filled
+) -> PackedSplats:
+    """Raises MemoryError for splats that would need absurd amounts of it.
+
+    Means, covariances and determinants may lie in columns 0, 1 and 2, 3, 4 and 6 of `packed` already: a splat's are
+    read before its row is written.
+    """
     m = len(means2d)
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     log2_cutoff = f32(math.log2(settings.alpha_cutoff))
-    visible, boxes = np.empty(m, np.bool_), np.empty((m, 4), np.int32)
-    packed = np.empty((m, PARAMETERS), np.float32)
+    pixel = np.uint16 if max(width, height) < 1 << 16 else np.int32  # memory: this is near its peak
+    visible, boxes = np.empty(m, np.bool_), np.empty((m, 4), pixel)
+    if packed is None:
+        packed = np.empty((m, PARAMETERS), np.float32)
     found, room = np.empty(CHUNKS, np.int64), np.empty(CHUNKS, np.int64)
     find_visible(
         means2d, covariances, depths, opacities, colors, log2_cutoff, width, height,
@@ -76,28 +121,49 @@ def bin_splats(
             f"rasterization: {found.sum()} visible Gaussians cover {room.sum()} tiles of the image, at most "
             f"{MOST_SLOTS} fit; are the scales in world units?"
         )
-    slots, rows = np.empty(room.sum(), np.int32), np.empty(room.sum(), np.int32)
+    slots, rows = np.empty(room.sum(), np.int32), np.empty(room.sum(), np.uint16)
     first_slot, slots_used = np.empty(m, np.int32), np.empty(m, np.int32)
+    counts = np.empty((CHUNKS, tiles_x * tiles_y), np.int64)
     find_tiles(
         means2d, covariances, determinants, colors, log2_cutoff, tiles_x,
-        visible, boxes, room, packed, slots, rows, first_slot, slots_used,
+        visible, boxes, room, packed, slots, rows, first_slot, slots_used, counts,
     )  # fmt: skip
-    del boxes  # the peak of memory comes next
+    return PackedSplats(visible, packed, first_slot, slots_used, slots, rows, counts)
 
-    keys, order = np.empty(found.sum(), np.uint32), np.empty(found.sum(), np.int32)
-    gather_keys(visible, depths, found, keys, order)
-    order = sort_by_key(keys, order)
-    counts = np.empty((CHUNKS, tiles_x * tiles_y), np.int64)
-    count_tiles(order, first_slot, slots_used, slots, counts)
-    starts = np.empty(tiles_x * tiles_y + 1, np.int64)
-    entries = np.empty((start_tiles(counts, starts), 2), np.int32)
-    fill_tiles(order, first_slot, slots_used, slots, rows, counts, entries)
-    return TileLists(visible, packed, starts, entries, first_slot, slots_used, slots)
+
+def list_tiles(splats: PackedSplats, depths: np.ndarray) -> TileLists:
+    """The lists of all tiles. The slots and counts of `splats` are used up: they become those of the lists."""
+    s = splats
+    starts = np.empty(s.counts.shape[1] + 1, np.int64)
+    total = start_tiles(s.counts, starts)
+    entries, keys = np.empty((total, 2), np.int32), np.empty(total, np.uint32)
+    fill_tiles(s.visible, depths, s.first_slot, s.slots_used, s.slots, s.rows, s.counts, entries, keys)
+    order = np.empty(total, np.int32)
+    sort_tiles(starts, keys, order)
+    return TileLists(s.visible, s.packed, starts, entries, order, s.first_slot, s.slots_used, s.slots)
 
 
 @njit(inline="always")
 def chunk_bounds(chunk, count):
     return chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS
+
+
+@njit(inline="always")
+def turns(tiles):
+    return (tiles + STRIDE - 1) // STRIDE * STRIDE
+
+
+@njit(inline="always")
+def tile_at(turn, tiles):
+    """Every STRIDE-th tile, then the next such series: each thread's share is spread over the image."""
+    series = (tiles + STRIDE - 1) // STRIDE
+    return turn % series * STRIDE + turn // series
+
+
+@njit(inline="always")
+def signed(number):
+    """An unsigned number that may be mixed with signed ones: numba would make floats of them."""
+    return np.int64(number)
 
 
 @njit(inline="always")
@@ -142,8 +208,8 @@ def find_visible(
             y0, y1 = pixel_interval(means[i, 1] - half_y, means[i, 1] + half_y, height)
             if x0 <= x1 and y0 <= y1:
                 boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = int(x0), int(x1), int(y0), int(y1)
-                columns = int(x1) // TILE_WIDTH - int(x0) // TILE_WIDTH + 1
-                tiles += columns * (int(y1) // TILE_HEIGHT - int(y0) // TILE_HEIGHT + 1)
+                columns = (int(x1) >> TILE_X_BITS) - (int(x0) >> TILE_X_BITS) + 1
+                tiles += columns * ((int(y1) >> TILE_Y_BITS) - (int(y0) >> TILE_Y_BITS) + 1)
                 packed[i, 5] = log2_opacity
                 visible[i] = True
                 n += 1
@@ -153,10 +219,11 @@ def find_visible(
 @njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
 def find_tiles(
     means, covariances, determinants, colors, log2_cutoff, tiles_x, visible, boxes, room,
-    packed, slots, rows, first_slot, slots_used,
+    packed, slots, rows, first_slot, slots_used, counts,
 ):  # fmt: skip
-    """Packs the visible splats, and lists the tiles (`slots`) and rows that each one touches."""
+    """Packs the visible splats, lists the tiles (`slots`) and rows that each one touches, and counts by tile."""
     for chunk in prange(CHUNKS):
+        counts[chunk, :] = 0
         begin, end = chunk_bounds(chunk, means.shape[0])
         slot = np.int64(0)
         for c in range(chunk):
@@ -182,9 +249,14 @@ def find_tiles(
             top_dx = b * np.sqrt(reach / c)  # where the ellipse is highest; lowest at -top_dx
             inv_a = ONE / a
             slope, spread, reach_a = b * inv_a, det * inv_a * inv_a, reach * a
-            x0, x1, y0, y1 = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
+            x0, x1, y0, y1 = (
+                signed(boxes[i, 0]),
+                signed(boxes[i, 1]),
+                signed(boxes[i, 2]),
+                signed(boxes[i, 3]),
+            )
             first = slot
-            for column in range(x0 // TILE_WIDTH, x1 // TILE_WIDTH + 1):
+            for column in range(x0 >> TILE_X_BITS, (x1 >> TILE_X_BITS) + 1):
                 left = max(f32(column * TILE_WIDTH) + HALF - x, -half_x)
                 right = min(f32(column * TILE_WIDTH + TILE_WIDTH) - HALF - x, half_x)
                 high_dx = min(max(top_dx, left), right)
@@ -195,80 +267,14 @@ def find_tiles(
                 row1 = min(int(np.floor(y + high + SLACK - HALF)), y1)
                 if row0 > row1:
                     continue
-                for row in range(row0 // TILE_HEIGHT, row1 // TILE_HEIGHT + 1):
+                for row in range(row0 >> TILE_Y_BITS, (row1 >> TILE_Y_BITS) + 1):
                     top = row * TILE_HEIGHT
                     slots[slot] = row * tiles_x + column
+                    counts[chunk, row * tiles_x + column] += 1
                     rows[slot] = max(row0 - top, 0) * 256 + min(row1 - top, TILE_HEIGHT - 1)
                     slot += 1
             first_slot[i] = first
             slots_used[i] = slot - first
-
-
-@njit(parallel=True, cache=True)
-def gather_keys(visible, depths, found, keys, order):
-    """Depth keys and indices of the visible splats, in the order of the input."""
-    bits = depths.view(np.uint32)  # depths are positive: their bits sort as they do
-    for chunk in prange(CHUNKS):
-        begin, end = chunk_bounds(chunk, visible.shape[0])
-        n = np.int64(0)
-        for c in range(chunk):
-            n += found[c]
-        for i in range(begin, end):
-            if visible[i]:
-                keys[n] = bits[i]
-                order[n] = i
-                n += 1
-
-
-def sort_by_key(keys: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """`order` sorted by `keys` [S] uint32: a stable radix sort over the bits in which keys differ."""
-    if len(keys) == 0:
-        return order
-    lowest = keys.min()
-    span = int(keys.max() - lowest).bit_length()
-    counts = np.empty((CHUNKS, 1 << RADIX_BITS), np.int32)
-    for shift in range(0, span, RADIX_BITS):
-        sorted_keys, sorted_order = np.empty_like(keys), np.empty_like(order)
-        radix_pass(keys, order, lowest, np.uint32(shift), counts, sorted_keys, sorted_order)
-        keys, order = sorted_keys, sorted_order
-    return order
-
-
-@njit(parallel=True, cache=True)
-def radix_pass(keys, order, lowest, shift, counts, sorted_keys, sorted_order):
-    n = keys.shape[0]
-    digits = np.uint32((1 << RADIX_BITS) - 1)
-    for chunk in prange(CHUNKS):
-        counts[chunk, :] = 0
-        begin, end = chunk_bounds(chunk, n)
-        for i in range(begin, end):
-            counts[chunk, ((keys[i] - lowest) >> shift) & digits] += 1
-    position = np.int32(0)
-    for digit in range(1 << RADIX_BITS):
-        for chunk in range(CHUNKS):
-            here = counts[chunk, digit]
-            counts[chunk, digit] = position
-            position += here
-    for chunk in prange(CHUNKS):
-        begin, end = chunk_bounds(chunk, n)
-        for i in range(begin, end):
-            digit = ((keys[i] - lowest) >> shift) & digits
-            to = counts[chunk, digit]
-            counts[chunk, digit] = to + 1
-            sorted_keys[to] = keys[i]
-            sorted_order[to] = order[i]
-
-
-@njit(parallel=True, cache=True)
-def count_tiles(order, first_slot, slots_used, slots, counts):
-    """Entries of each tile, by chunk of the depth order."""
-    for chunk in prange(CHUNKS):
-        counts[chunk, :] = 0
-        begin, end = chunk_bounds(chunk, order.shape[0])
-        for rank in range(begin, end):
-            i = order[rank]
-            for slot in range(first_slot[i], first_slot[i] + slots_used[i]):
-                counts[chunk, slots[slot]] += 1
 
 
 @njit(cache=True)
@@ -287,16 +293,78 @@ def start_tiles(counts, starts):
 
 
 @njit(parallel=True, cache=True)
-def fill_tiles(order, first_slot, slots_used, slots, rows, counts, entries):
-    """Writes the tiles' entries in depth order; the slots then say where a splat's entries are."""
+def fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, entries, keys):
+    """Writes the tiles' entries and depth keys; the slots then say where a splat's entries are."""
+    bits = depths.view(np.uint32)  # depths are positive: their bits sort as they do
     for chunk in prange(CHUNKS):
-        begin, end = chunk_bounds(chunk, order.shape[0])
-        for rank in range(begin, end):
-            i = order[rank]
+        begin, end = chunk_bounds(chunk, visible.shape[0])
+        for i in range(begin, end):
+            if not visible[i]:
+                continue
             for slot in range(first_slot[i], first_slot[i] + slots_used[i]):
                 tile = slots[slot]
                 to = counts[chunk, tile]
                 counts[chunk, tile] = to + 1
                 entries[to, 0] = i
                 entries[to, 1] = rows[slot]
+                keys[to] = bits[i]
                 slots[slot] = to
+
+
+@njit(parallel=True, cache=True)
+def sort_tiles(starts, keys, order):
+    """`order` [E]: each tile's entries by `keys` [E], equal ones as they come."""
+    tiles = starts.shape[0] - 1
+    for turn in prange(turns(tiles)):
+        tile = tile_at(turn, tiles)
+        if tile < tiles:
+            begin, end = starts[tile], starts[tile + 1]
+            if end - begin <= FEW:
+                sort_few(keys[begin:end], order[begin:end], begin)
+            else:
+                sort_many(keys[begin:end], order[begin:end], begin)
+
+
+@njit(cache=True)
+def sort_few(keys, order, begin):
+    """Insertion sort."""
+    for i in range(keys.shape[0]):
+        key, at = keys[i], i
+        while at > 0 and keys[order[at - 1] - begin] > key:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = begin + i
+
+
+@njit(cache=True)
+def sort_many(keys, order, begin):
+    """Radix sort over those digits in which keys differ."""
+    n = keys.shape[0]
+    lowest, highest = keys[0], keys[0]
+    for i in range(n):
+        lowest, highest = min(lowest, keys[i]), max(highest, keys[i])
+    counts = np.zeros((DIGITS, RADIX), np.int32)
+    # Key and place in one number: one memory access moves both.
+    pairs, other = np.empty(n, np.uint64), np.empty(n, np.uint64)
+    for i in range(n):
+        key = np.uint32(keys[i] - lowest)
+        pairs[i] = np.uint64(key) << np.uint64(32) | np.uint64(i)
+        for digit in range(DIGITS):
+            counts[digit, (key >> np.uint32(digit * RADIX_BITS)) & np.uint32(RADIX - 1)] += 1
+    for digit in range(DIGITS):
+        if (highest - lowest) >> np.uint32(digit * RADIX_BITS) == 0:
+            break
+        position = np.int32(0)
+        for value in range(RADIX):
+            here = counts[digit, value]
+            counts[digit, value] = position
+            position += here
+        shift = np.uint64(32 + digit * RADIX_BITS)
+        for i in range(n):
+            value = (pairs[i] >> shift) & np.uint64(RADIX - 1)
+            to = counts[digit, value]
+            counts[digit, value] = to + 1
+            other[to] = pairs[i]
+        pairs, other = other, pairs
+    for i in range(n):
+        order[i] = begin + np.int64(pairs[i] & np.uint64(0xFFFFFFFF))

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.render.binning import TileLists, bin_splats
-from compgs.render.projection import Project, as_array, camera_numbers
+from compgs.render.binning import PARAMETERS, TileLists, bin_splats, list_tiles, pack_splats
+from compgs.render.projection import Project, as_array, camera_numbers, project_forward
 from compgs.render.result import RasterResult
 from compgs.render.settings import RasterSettings
 from compgs.render.tiles import MOMENTS, blend_backward, blend_forward, sum_moments
@@ -21,6 +21,8 @@ from compgs.render.tiles import MOMENTS, blend_backward, blend_forward, sum_mome
 
 def rasterize_numba(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> RasterResult:
     """float32 tensors on the CPU."""
+    if not (torch.is_grad_enabled() and any(t.requires_grad for t in tensors_of(gaussians))):
+        return draw(gaussians, camera, settings)
     means2d, covariances, depths, determinants = Project.apply(
         gaussians.means, gaussians.quaternions, gaussians.scales, camera_numbers(camera, settings)
     )
@@ -28,6 +30,66 @@ def rasterize_numba(gaussians: Gaussians, camera: Camera, settings: RasterSettin
         means2d, covariances, gaussians.opacities, gaussians.colors, depths, determinants, camera, settings
     )
     return RasterResult(image, transmittance, means2d, visible)
+
+
+def tensors_of(gaussians: Gaussians) -> tuple[Tensor, ...]:
+    g = gaussians
+    return g.means, g.quaternions, g.scales, g.opacities, g.colors
+
+
+@torch.no_grad()
+def draw(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> RasterResult:
+    """The same image where no gradient is wanted; what the next part does not need is given back at once."""
+    m = len(gaussians)
+    packed, depths = np.empty((m, PARAMETERS), np.float32), np.empty(m, np.float32)
+    # In the columns that they give way to: rendering stays below three times the size of the decoded model.
+    means2d, covariances, determinants = packed[:, 0:2], packed[:, 2:5], packed[:, 6]
+    project_forward(
+        as_array(gaussians.means),
+        as_array(gaussians.quaternions),
+        as_array(gaussians.scales),
+        camera_numbers(camera, settings),
+        means2d,
+        covariances,
+        depths,
+        determinants,
+    )
+    splats = pack_splats(
+        means2d=means2d,
+        covariances=covariances,
+        determinants=determinants,
+        depths=depths,
+        opacities=as_array(gaussians.opacities),
+        colors=as_array(gaussians.colors),
+        width=camera.width,
+        height=camera.height,
+        settings=settings,
+        packed=packed,
+    )
+    lists = list_tiles(splats, depths)
+    image, transmittance, _ = blend(lists, camera, settings)
+    del splats, depths
+    visible = torch.from_numpy(lists.visible)
+    return RasterResult(image, transmittance, torch.from_numpy(means2d.copy()), visible)
+
+
+def blend(lists: TileLists, camera: Camera, settings: RasterSettings) -> tuple[Tensor, Tensor, np.ndarray]:
+    """image [H, W, 3], transmittance [H, W], and per tile the entry after the last one needed."""
+    image = torch.empty(camera.height, camera.width, 3)
+    transmittance = torch.empty(camera.height, camera.width)
+    ends = np.empty(len(lists.starts) - 1, np.int64)
+    blend_forward(
+        lists.packed,
+        lists.starts,
+        lists.entries,
+        lists.order,
+        np.array(settings.background, np.float32),
+        *blend_thresholds(settings),
+        image.numpy(),
+        transmittance.numpy(),
+        ends,
+    )
+    return image, transmittance, ends
 
 
 class Blend(torch.autograd.Function):
@@ -56,23 +118,8 @@ class Blend(torch.autograd.Function):
             height=camera.height,
             settings=settings,
         )
-        image = means2d.new_empty(camera.height, camera.width, 3)
-        transmittance = means2d.new_empty(camera.height, camera.width)
-        ends = np.empty(len(lists.starts) - 1, np.int64)
-        cutoff, cap, stop = thresholds = blend_thresholds(settings)
-        blend_forward(
-            lists.packed,
-            lists.starts,
-            lists.entries,
-            np.array(settings.background, np.float32),
-            cutoff,
-            cap,
-            stop,
-            as_array(image),
-            as_array(transmittance),
-            ends,
-        )
-        ctx.lists, ctx.ends, ctx.thresholds = lists, ends, thresholds
+        image, transmittance, ends = blend(lists, camera, settings)
+        ctx.lists, ctx.ends, ctx.thresholds = lists, ends, blend_thresholds(settings)
         ctx.save_for_backward(image, transmittance, opacities)
         visible_mask = torch.from_numpy(lists.visible)
         ctx.mark_non_differentiable(visible_mask)
@@ -88,6 +135,7 @@ class Blend(torch.autograd.Function):
             lists.packed,
             lists.starts,
             lists.entries,
+            lists.order,
             ctx.ends,
             cutoff,
             cap,

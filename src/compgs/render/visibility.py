@@ -11,6 +11,7 @@ It holds for splats as they are drawn, by the first-order projection, which can 
 ellipsoid.
 """
 
+import functools
 import math
 
 import numpy as np
@@ -33,18 +34,23 @@ def visible_mask(
     settings: RasterSettings,
 ) -> Tensor:  # [N] bool
     """False only where nothing of an anchor can reach a pixel."""
-    planes = frustum(camera, settings)
     if positions.device.type == "cpu" and positions.dtype == radii.dtype == torch.float32:
         mask = torch.empty(len(positions), dtype=torch.bool)
         meet_frustum(
             positions.detach().contiguous().numpy(),
             radii.detach().contiguous().numpy(),
-            planes.astype(np.float32),
+            frustum(camera, settings).astype(np.float32),
             mask.numpy(),
         )
         return mask
-    normals = torch.as_tensor(planes, dtype=positions.dtype, device=positions.device)
+    normals = frustum_on(camera, settings, positions.dtype, positions.device)
     return (positions @ normals[:, :3].T + normals[:, 3] >= -radii[:, None] * normals[:, 4]).all(1)
+
+
+@functools.lru_cache(maxsize=4096)
+def frustum_on(camera: Camera, settings: RasterSettings, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`frustum` on a device; kept, as a copy to a GPU waits for it to finish its work."""
+    return torch.as_tensor(frustum(camera, settings), dtype=dtype, device=device)
 
 
 def frustum(camera: Camera, settings: RasterSettings) -> np.ndarray:

@@ -61,12 +61,13 @@ class AdaptiveControl:
     def observe(self, rows: Tensor, prediction: Prediction, mean_gradient: Tensor, camera: Camera) -> None:
         """One training view: visible anchors [V], their prediction, gradient of the loss by the 2D means [M, 2]."""
         k = self.config.model.coupled_primitives
-        half_image = mean_gradient.new_tensor([camera.width / 2, camera.height / 2])
-        norms = (mean_gradient * half_image).norm(dim=1)
+        norms = torch.hypot(
+            mean_gradient[:, 0] * (camera.width / 2), mean_gradient[:, 1] * (camera.height / 2)
+        )
         slots = rows[prediction.index // k] * k + prediction.index % k
         drawn = norms > 0
         self.gradient.view(-1).index_put_((slots,), norms, accumulate=True)
-        self.drawn.view(-1).index_put_((slots[drawn],), torch.ones_like(norms[drawn]), accumulate=True)
+        self.drawn.view(-1).index_put_((slots,), drawn.to(norms.dtype), accumulate=True)
         self.seen[rows] += 1
         self.opacity[rows] += prediction.opacities.clamp_min(0).view(-1, k).sum(1)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from compgs.config import TrainingConfig
@@ -34,7 +35,7 @@ class TrainingStatus:
 
 @dataclass(frozen=True)
 class StepResult:
-    loss: float
+    loss: Tensor  # []; a number only when somebody reads it: a GPU is not waited for
     image: Tensor  # [H, W, 3]
     view: View
 
@@ -88,9 +89,9 @@ def run_to_end(
                 pace = recent if not pace or recent < 0.5 * pace else 0.9 * pace + 0.1 * recent
                 reported, counted = now, trainer.step
                 on_progress(_status(trainer, config.steps, result, estimate, pace))
-            if trainer.step % REPORT_EVERY == 0 and not np.isfinite(result.loss):
+            if trainer.step % REPORT_EVERY == 0 and not torch.isfinite(result.loss):
                 raise TrainingError(
-                    f"step {trainer.step}: the loss is {result.loss}; try a lower learning rate or another seed"
+                    f"step {trainer.step}: the loss is {float(result.loss)}; try a lower learning rate or another seed"
                 )
             if path and now - saved > 60 * config.checkpoint_minutes:
                 trainer.save(path)
@@ -109,5 +110,5 @@ def _status(trainer: Trains, steps: int, result: StepResult, estimate: int, pace
     error = float(((result.image.clamp(0, 1) - photograph) ** 2).mean())
     psnr = -10.0 * float(np.log10(max(error, 1e-10)))
     return TrainingStatus(
-        trainer.step, steps, result.loss, psnr, trainer.primitives, trainer.kind, estimate, pace
+        trainer.step, steps, float(result.loss), psnr, trainer.primitives, trainer.kind, estimate, pace
     )

@@ -149,7 +149,7 @@ class SplatTrainer:
         self.control_density()
         profile.lap("density control")
         profile.end()
-        return StepResult(float(loss.detach()), rendered.image.detach(), view)
+        return StepResult(loss.detach(), rendered.image.detach(), view)
 
     def control_density(self) -> None:
         """What the schedule asks for after so many steps."""

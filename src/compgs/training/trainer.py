@@ -21,7 +21,7 @@ from compgs.losses import (
     revival_loss,
     scale_regularizer,
 )
-from compgs.model.prediction import OPACITY_CUTOFF, Prediction, predict
+from compgs.model.prediction import OPACITY_CUTOFF, Prediction, camera_center, choosing_pays, predict
 from compgs.render import RasterSettings, rasterize, visible_mask
 from compgs.scene.points import median_spacing, voxel_grid
 from compgs.scene.views import Scene, View
@@ -37,7 +37,7 @@ from compgs.training.checkpoint import (
 )
 from compgs.training.control import AdaptiveControl, make_schedule
 from compgs.training.loop import StepResult, TrainingStatus, next_view, run_to_end
-from compgs.training.optimizers import make_optimizer, set_learning_rates
+from compgs.training.optimizers import make_optimizer, set_learning_rates, step_rows
 from compgs.training.profile import NoProfile, StepProfile
 
 # With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
@@ -131,9 +131,8 @@ class Trainer:
         if self.schedule.active(self.step):
             rendered.means2d.retain_grad()
         distortion = photometric_loss(rendered.image, self.target(view_index), t.ssim_weight)
-        loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales)
-        if len(prediction.index) < FEW_DRAWN * len(prediction.opacities):
-            loss = loss + revival_loss(prediction.opacities)
+        loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales, prediction.drawn)
+        loss = loss + self.revival(prediction)
         profile.lap("loss")
         if latents.bits:
             elements = self.elements(len(rows))
@@ -151,6 +150,8 @@ class Trainer:
         profile.lap("entropy, backward")
 
         set_learning_rates(self.optimizer, progress, t.head_warm_up)
+        if t.sparse_adam:
+            step_rows(self.model, self.optimizer, rows)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         profile.lap("optimizer")
@@ -163,13 +164,22 @@ class Trainer:
             profile.lap("control")
         profile.end()
         self.step += 1
-        return StepResult(float(loss.detach()), rendered.image.detach(), view)
+        return StepResult(loss.detach(), rendered.image.detach(), view)
+
+    def revival(self, prediction: Prediction) -> Tensor | float:
+        """The loss that keeps a scene of which hardly anything is drawn from vanishing; 0 otherwise."""
+        if prediction.drawn is not None:
+            few = prediction.drawn.float().mean() < FEW_DRAWN
+            return torch.where(few, revival_loss(prediction.opacities), 0.0)
+        if len(prediction.index) < FEW_DRAWN * len(prediction.opacities):
+            return revival_loss(prediction.opacities)
+        return 0.0
 
     def skip(self, view: View) -> StepResult:
         """A step on a view that no anchor is in: nothing can be learned from it."""
         self.step += 1
         background = torch.tensor(self.scene.background, device=self.device)
-        return StepResult(0.0, background.expand(*view.image.shape), view)
+        return StepResult(torch.zeros(()), background.expand(*view.image.shape), view)
 
     def target(self, view_index: int) -> Target:
         if view_index not in self.targets:
@@ -188,10 +198,17 @@ class Trainer:
         return torch.nonzero(visible_mask(model.positions(), radii, camera, self.settings)).view(-1)
 
     def predict(self, latents: Quantized, rows: Tensor, camera: Camera, stored: bool) -> Prediction:
-        center = torch.as_tensor(camera.center, dtype=torch.float32, device=self.device)
-        weights = self.model.stored_head_weights() if stored else None
-        primitives = self.model.primitives(latents, rows)
-        return predict(self.model.heads, primitives, center, self.model.distance_unit, weights)
+        """On the GPU all primitives of the anchors in view: choosing among them would mean waiting for it."""
+        model = self.model
+        return predict(
+            model.heads,
+            model.primitives(latents, rows),
+            camera_center(camera, self.device),
+            model.distance_unit,
+            model.stored_head_weights() if stored else None,
+            compact=choosing_pays(self.device),
+            appearance_dtype=getattr(torch, self.config.training.appearance_dtype),
+        )
 
     def elements(self, anchors: int) -> dict[str, int]:
         """Number of coded symbols of each stream for so many anchors."""

@@ -1,0 +1,95 @@
+"""The compiled way from anchors in view to Gaussians, against plain torch in float64."""
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from compgs.cameras import Camera
+from compgs.gaussians import Gaussians
+from compgs.model import HybridModel, PredictionHeads, Primitives, predict
+from compgs.model.appearance import ANCHORS, sigmoid
+from compgs.model.primitives import select_anchors
+from compgs.model.residual_mlp import ROWS
+
+N, D, G = 3 * ANCHORS + 17, 12, 8
+FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
+POSE = np.eye(4)
+POSE[:3, 3] = (0.3, -1.0, 2.0)
+CAMERA = Camera(POSE, 50, 50, 32, 32, 64, 64)
+
+
+def make_model(counts: torch.Tensor, positions: torch.Tensor | None = None) -> HybridModel:
+    """counts: [N] coupled primitives of each anchor."""
+    g = torch.Generator().manual_seed(3)
+    torch.manual_seed(0)
+    n = len(counts)
+    primitives = Primitives(
+        positions=3 * torch.randn(n, 3, generator=g) if positions is None else positions,
+        log_scales=torch.randn(n, 6, generator=g),
+        references=torch.randn(n, D, generator=g),
+        residuals=torch.randn(int(counts.sum()), G, generator=g),
+        anchor_index=torch.repeat_interleave(counts),
+        voxel_size=0.05,
+    )
+    heads = PredictionHeads(D, G, 16, "paired").requires_grad_(False)
+    return HybridModel(primitives, heads, 4.0, (0.0, 0.0, 0.0))
+
+
+def truth(model: HybridModel, visible: torch.Tensor) -> Gaussians:
+    p = select_anchors(model.primitives, visible)
+    names = ("positions", "log_scales", "references", "residuals")
+    wide = Primitives(
+        *(getattr(p, name).double() for name in names), anchor_index=p.anchor_index, voxel_size=p.voxel_size
+    )
+    heads = PredictionHeads(D, G, 16, "paired").double()
+    heads.load_state_dict(model.heads.state_dict())
+    return predict(heads, wide, torch.tensor(CAMERA.center), model.distance_unit).gaussians
+
+
+def counts_with(*special: int) -> torch.Tensor:
+    counts = torch.randint(0, 6, (N,), generator=torch.Generator().manual_seed(4))
+    counts[: len(special)] = torch.tensor(special)
+    counts[-1] = special[0]
+    return counts
+
+
+@pytest.mark.parametrize("special", [(0, 0, 1), (ROWS, 0, ROWS - 1), (3 * ROWS + 1, ROWS + 1)])
+@pytest.mark.parametrize("share", [0.02, 0.6, 1.0])
+def test_gaussians_agree_with_float64_whatever_the_number_of_primitives(special, share):
+    model = make_model(counts_with(*special))
+    visible = torch.rand(N, generator=torch.Generator().manual_seed(5)) < share
+    found, expected = model.gaussians(CAMERA, visible), truth(model, visible)
+    assert len(found) == len(expected) > 0
+    for name in FIELDS:
+        torch.testing.assert_close(
+            getattr(found, name).double(), getattr(expected, name), atol=2e-6, rtol=1e-5
+        )
+
+
+def test_an_anchor_at_the_camera_has_finite_colors():
+    center = torch.tensor(CAMERA.center, dtype=torch.float32)
+    model = make_model(torch.full((3,), 5), positions=center.repeat(3, 1))
+    assert torch.isfinite(model.gaussians(CAMERA).colors).all()
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
+def test_gaussians_do_not_depend_on_the_number_of_threads():
+    model = make_model(counts_with(200, 3))
+    two = model.gaussians(CAMERA)
+    numba.set_num_threads(1)
+    try:
+        one = model.gaussians(CAMERA)
+    finally:
+        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    for name in FIELDS:
+        assert torch.equal(getattr(one, name), getattr(two, name))
+
+
+def test_the_sigmoid_is_right_to_single_precision_everywhere():
+    x = np.concatenate([np.linspace(-100, 100, 40_001), [-1e30, -np.inf, np.inf, 1e30, 0.0]])
+    x = x.astype(np.float32)
+    found = numba.vectorize(["f4(f4)"])(lambda t: sigmoid(t))(x)
+    with np.errstate(over="ignore"):
+        expected = 1 / (1 + np.exp(-x.astype(np.float64)))
+    assert np.abs(found - expected).max() < 2e-7

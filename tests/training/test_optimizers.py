@@ -1,0 +1,108 @@
+"""Adam for the anchors in view."""
+
+from dataclasses import replace
+
+import numba
+import pytest
+import torch
+
+from compgs.training.optimizers import ANCHOR_PARAMETERS, adam_rows, make_optimizer, step_rows
+from compgs.training.trainer import Trainer, initial_model
+
+CPU = torch.device("cpu")
+
+
+def run(scene, config, views: list[torch.Tensor], step) -> dict[str, torch.Tensor]:
+    """Parameters and moments after one step a view, gradients being random where the view has anchors."""
+    model = initial_model(scene, config)
+    optimizer = make_optimizer(model, config.training)
+    noise = torch.Generator().manual_seed(0)
+    for rows in views:
+        for name in ANCHOR_PARAMETERS:
+            parameter = getattr(model, name)
+            parameter.grad = torch.zeros_like(parameter)
+            parameter.grad[rows] = torch.randn(len(rows), parameter.shape[1], generator=noise)
+        step(model, optimizer, rows)
+    result = {}
+    for name in ANCHOR_PARAMETERS:
+        parameter = getattr(model, name)
+        state = optimizer.state[parameter]
+        result |= {name: parameter.detach(), f"{name}/1": state["exp_avg"], f"{name}/2": state["exp_avg_sq"]}
+    return result
+
+
+def dense(model, optimizer, rows):
+    optimizer.step()
+
+
+def sparse(model, optimizer, rows):
+    step_rows(model, optimizer, rows)
+    assert all(getattr(model, name).grad is None for name in ANCHOR_PARAMETERS)
+
+
+def plain(model, optimizer, rows):
+    """`adam_rows`, as on a GPU."""
+    for group in optimizer.param_groups[: len(ANCHOR_PARAMETERS)]:
+        (p,) = group["params"]
+        state = optimizer.state[p]
+        if not state:
+            state |= {"step": torch.zeros(()), "exp_avg": torch.zeros_like(p)}
+            state["exp_avg_sq"] = torch.zeros_like(p)
+        state["step"] += 1
+        parts = p.detach(), p.grad, state["exp_avg"], state["exp_avg_sq"]
+        adam_rows(rows, *parts, state["step"], group)
+
+
+def close(found, expected):
+    for name, value in expected.items():
+        torch.testing.assert_close(
+            found[name], value, atol=5e-7, rtol=2e-5, msg=lambda m, n=name: f"{n}: {m}"
+        )
+
+
+def test_with_all_anchors_in_view_it_is_torchs_adam(blob_scene, tiny_config):
+    everything = [torch.arange(initial_model(blob_scene, tiny_config).anchors)] * 5
+    expected = run(blob_scene, tiny_config, everything, dense)
+    close(run(blob_scene, tiny_config, everything, sparse), expected)
+    close(run(blob_scene, tiny_config, everything, plain), expected)
+
+
+def some_views(scene, config) -> list[torch.Tensor]:
+    n, chance = initial_model(scene, config).anchors, torch.Generator().manual_seed(1)
+    return [torch.nonzero(torch.rand(n, generator=chance) < 0.4).view(-1) for _ in range(5)]
+
+
+def test_the_kernel_does_what_plain_torch_does(blob_scene, tiny_config):
+    views = some_views(blob_scene, tiny_config)
+    close(run(blob_scene, tiny_config, views, sparse), run(blob_scene, tiny_config, views, plain))
+
+
+def test_anchors_out_of_view_keep_their_values_and_moments(blob_scene, tiny_config):
+    views = some_views(blob_scene, tiny_config)
+    before = run(blob_scene, tiny_config, views[:4], sparse)
+    after = run(blob_scene, tiny_config, views, sparse)
+    unseen = torch.ones(len(before["references"]), dtype=torch.bool)
+    unseen[views[4]] = False
+    for name, value in before.items():
+        assert torch.equal(after[name][unseen], value[unseen])
+        assert not torch.equal(after[name], value)
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
+def test_the_same_bits_with_one_thread_and_with_two(blob_scene, tiny_config):
+    views = some_views(blob_scene, tiny_config)
+    two = run(blob_scene, tiny_config, views, sparse)
+    numba.set_num_threads(1)
+    try:
+        one = run(blob_scene, tiny_config, views, sparse)
+    finally:
+        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    for name, value in one.items():
+        assert torch.equal(value, two[name])
+
+
+def test_a_run_with_sparse_adam_learns(blob_scene, tiny_config):
+    config = replace(tiny_config, training=replace(tiny_config.training, sparse_adam=True, steps=100))
+    trainer = Trainer(blob_scene, config, CPU)
+    losses = [float(trainer.train_step().loss) for _ in range(100)]
+    assert sum(losses[-10:]) < 0.7 * sum(losses[:10])

@@ -1,0 +1,105 @@
+"""What a training step may wait for on a GPU: the number of anchors in view, and nothing of its own besides.
+
+Without a GPU: tensors on "meta" have shapes but no values, and whatever needs a value fails.
+"""
+
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+
+from compgs.config import Config
+from compgs.render import RasterResult, visible_mask
+from compgs.training import trainer as trainer_module
+from compgs.training.optimizers import adam_rows
+from compgs.training.trainer import Trainer
+
+META = torch.device("meta")
+
+
+def rasterize_nothing(gaussians, camera, settings) -> RasterResult:
+    """An image that depends on all Gaussians, in shape: gsplat's place."""
+    means2d = gaussians.means[:, :2] * 1.0
+    total = means2d.sum() + gaussians.colors.sum() + gaussians.opacities.sum()
+    total = total + gaussians.scales.sum() + gaussians.quaternions.sum()
+    image = total.expand(camera.height, camera.width, 3)
+    return RasterResult(image, image[..., 0], means2d, gaussians.opacities > 0)
+
+
+def valueless_trainer(scene, config: Config, monkeypatch) -> Trainer:
+    trainer = Trainer(scene, config, torch.device("cpu"))
+    trainer.model.to(META)
+    trainer.device = META
+    trainer.noise.pool = trainer.noise.pool.to(META)
+    for name in trainer.control.STATISTICS:
+        setattr(trainer.control, name, getattr(trainer.control, name).to(META))
+    trainer.optimizer = torch.optim.SGD(trainer.optimizer.param_groups, lr=1e-3)
+    rows = torch.arange(trainer.model.anchors // 2, device=META)
+    monkeypatch.setattr(Trainer, "visible_anchors", lambda self, camera: rows)
+    monkeypatch.setattr(trainer_module, "rasterize", rasterize_nothing)
+    return trainer
+
+
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("progress", [0.0, 0.15, 0.75])
+def test_a_step_needs_no_value_but_which_anchors_are_in_view(
+    blob_scene, tiny_config, monkeypatch, layout, progress
+):
+    config = replace(tiny_config, model=replace(tiny_config.model, heads=layout))
+    trainer = valueless_trainer(blob_scene, config, monkeypatch)
+    monkeypatch.setattr(trainer_module, "choosing_pays", lambda device: False)
+    trainer.step = int(progress * config.training.steps)
+    assert trainer.train_step().loss.shape == ()
+
+
+def test_choosing_among_primitives_would_need_values(blob_scene, tiny_config, monkeypatch):
+    trainer = valueless_trainer(blob_scene, tiny_config, monkeypatch)
+    with pytest.raises((RuntimeError, NotImplementedError)):
+        trainer.train_step()
+
+
+def test_culling_and_sparse_adam_need_no_values(blob_scene):
+    camera = blob_scene.train_views[0].camera
+    mask = visible_mask(
+        torch.zeros(7, 3, device=META), torch.zeros(7, device=META), camera, trainer_module.RasterSettings()
+    )
+    assert mask.shape == (7,)
+    state = [torch.zeros(7, 5, device=META) for _ in range(4)]
+    group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15}
+    adam_rows(torch.zeros(3, dtype=torch.int64, device=META), *state, torch.ones((), device=META), group)
+
+
+def test_leaving_nothing_out_trains_the_same_model(blob_scene, tiny_config, monkeypatch):
+    losses = []
+    for pays in (True, False):
+        monkeypatch.setattr(trainer_module, "choosing_pays", lambda device, pays=pays: pays)
+        trainer = Trainer(blob_scene, tiny_config, torch.device("cpu"))
+        losses.append([float(trainer.train_step().loss) for _ in range(6)])
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+
+
+def test_the_networks_of_appearance_train_in_bfloat16(blob_scene, tiny_config):
+    config = replace(tiny_config, training=replace(tiny_config.training, appearance_dtype="bfloat16"))
+    exact = Trainer(blob_scene, tiny_config, torch.device("cpu"))
+    rough = Trainer(blob_scene, config, torch.device("cpu"))
+    for _ in range(4):
+        assert float(rough.train_step().loss) == pytest.approx(float(exact.train_step().loss), rel=0.05)
+    assert all(p.dtype == torch.float32 for p in rough.model.parameters())
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_step_on_cuda_waits_for_two_numbers(blob_scene, tiny_config):
+    """The anchors in view, and (inside gsplat) the entries of all tiles."""
+    trainer = Trainer(blob_scene, tiny_config, torch.device("cuda"))
+    for _ in range(len(blob_scene.train_views)):  # every camera's constants are on the device then
+        trainer.train_step()
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as waits:
+            warnings.simplefilter("always")
+            trainer.train_step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert len([w for w in waits if "synchroniz" in str(w.message)]) <= 2
