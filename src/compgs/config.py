@@ -112,7 +112,7 @@ class TrainingConfig:
 @dataclass(frozen=True)
 class SplatConfig:
     """Plain 3D Gaussian Splatting (`--method 3dgs`; Kerbl et al. 2023), as published; schedules as fractions of its
-    30 000 steps, with floors in passes over the views (`training/densification.py`).
+    30 000 steps, with floors for short runs (`training/densification.py`).
     """
 
     harmonics: int = 3  # degree of the spherical harmonics at the end
@@ -126,7 +126,7 @@ class SplatConfig:
     rotation_lr: float = 1e-3  # of quaternions
     densify_start: float = 1 / 60  # of the steps (500 of 30 000)
     densify_stop: float = 0.5  # of the steps (15 000)
-    densify_every: float = 1 / 300  # of the steps (100), at least one pass over the views
+    densify_every: float = 1 / 300  # of the steps (100)
     gradient_threshold: float = 2e-4  # mean norm of the 2D gradient, in units of half the image
     split_size: float = 0.01  # scene extents: larger splats are split, smaller ones cloned
     prune_opacity: float = 0.005  # splats with less are removed

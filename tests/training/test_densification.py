@@ -158,6 +158,13 @@ def test_in_short_runs_every_view_is_seen_before_a_splat_is_judged_or_reset(step
 
 def test_fractions_of_the_schedule_are_settings():
     config = replace(SplatConfig(), densify_stop=0.8, reset_every=0.5)
-    schedule = densify_schedule(config, 1_000, 10)
-    assert schedule.stop == 800
-    assert [step for step in range(1_000) if schedule.reset_due(step)] == [500]
+    schedule = densify_schedule(config, 2_000, 10)
+    assert schedule.stop == 1_600
+    assert [step for step in range(2_000) if schedule.reset_due(step)] == [1_000]
+
+
+def test_few_views_do_not_make_judgements_and_resets_frequent():
+    schedule = densify_schedule(SplatConfig(), 2_000, 15)
+    assert schedule.every == 100
+    assert [step for step in range(2_000) if schedule.reset_due(step)] == [300, 600]
+    assert densify_schedule(SplatConfig(), 400, 15).every == 20  # ten judgements

@@ -14,6 +14,7 @@ from compgs.render import RasterSettings, rasterize, render
 from compgs.scene.views import Points
 from compgs.training import SplatTrainer, Trainer, train_splats
 from compgs.training.checkpoint import load_checkpoint
+from compgs.training.densification import DensifySchedule
 from compgs.training.splat_parameters import initial_splats
 
 CPU = torch.device("cpu")
@@ -21,13 +22,15 @@ CPU = torch.device("cpu")
 
 @pytest.fixture
 def config() -> Config:
-    """Forty steps that go through growth, a reset and all degrees."""
+    """Fifty steps that go through growth and all degrees."""
     return Config(
-        splats=SplatConfig(
-            harmonics_every=0.1, densify_every=0.2, densify_stop=0.9, gradient_threshold=1e-5, reset_every=0.3
-        ),
+        splats=SplatConfig(harmonics_every=0.1, densify_every=0.2, densify_stop=0.9, gradient_threshold=1e-5),
         training=TrainingConfig(steps=50, seed=3),
     )
+
+
+# Growth after steps 8, 18, 28, 38; resets after 15 and 30: short runs have none of their own accord.
+SCHEDULE = DensifySchedule(start=8, stop=45, every=10, reset_every=15)
 
 
 def file_of(model) -> bytes:
@@ -44,14 +47,17 @@ def test_the_same_seed_gives_the_same_file_and_another_seed_another(blob_scene, 
 
 def test_a_run_stopped_anywhere_continues_exactly(blob_scene, config, tmp_path):
     whole = SplatTrainer(blob_scene, config, CPU)
+    whole.schedule = SCHEDULE
     whole.run(None, None)
-    for stop in (1, 17, 33, 44):  # before, between and after growth and reset
+    for stop in (1, 15, 28, 44):
         path = tmp_path / f"{stop}.safetensors"
         first = SplatTrainer(blob_scene, config, CPU)
+        first.schedule = SCHEDULE
         for _ in range(stop):
             first.train_step()
         first.save(path)
         second = SplatTrainer.resumed(blob_scene, path, config, CPU)
+        second.schedule = SCHEDULE
         assert second.step == stop
         second.run(None, None)
         assert ply_bytes(whole.parameters.trained()) == ply_bytes(second.parameters.trained()), stop
@@ -90,7 +96,8 @@ def test_a_run_of_another_method_settings_or_scene_is_not_continued(
 def test_training_shows_the_held_out_view_and_a_late_reset_does_not_spoil_it(blob_scene):
     config = Config(training=TrainingConfig(steps=400, seed=0))
     trainer = SplatTrainer(blob_scene, config, CPU)
-    assert [s for s in range(400) if trainer.schedule.reset_due(s)], "no reset: the test is too weak"
+    trainer.schedule = replace(trainer.schedule, stop=300, reset_every=200)
+    assert [s for s in range(400) if trainer.schedule.reset_due(s)] == [200]
     (view,) = blob_scene.test_views
     flat = np.broadcast_to(view.image.mean((0, 1)).round().astype(np.uint8), view.image.shape)
     trainer.run(None, None)

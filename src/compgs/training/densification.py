@@ -5,9 +5,10 @@ splats are removed, and after the first reset of the opacities also those that a
 published program also removes what is large in the image; gsplat by default does not, and neither do we.)
 
 The published schedule counts steps of a run of 30 000. As mere fractions of a short run, it would judge splats that no
-view has shown since, and reset opacities faster than they recover. So there are floors: a pass over the views between
-two judgements, `RECOVERY_PASSES` between two resets, and no reset without the time to recover from it before
-densification ends. Floors end at the published numbers of steps: a run of 30 000 steps goes as published.
+view has shown since, or that have had no time to part from their clones, and reset opacities faster than they recover.
+So there are floors: a pass over the views between two judgements, and as many steps as published or a tenth of the
+time there is; between two resets `RECOVERY_PASSES` and `RECOVERY_STEPS`, and no reset without the time to recover
+before densification ends. Floors end at the published numbers of steps: a run of 30 000 steps goes as published.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +22,8 @@ from compgs.model.splats import Splats
 from compgs.training.splat_parameters import SplatParameters, replace_splats
 
 PUBLISHED_START, PUBLISHED_EVERY, PUBLISHED_RESET = 500, 100, 3_000  # steps
-RECOVERY_PASSES = 5  # over the views: opacities are back after some hundred steps in which a splat is seen
+RECOVERY_PASSES = 5  # over the views
+RECOVERY_STEPS = 300  # at the published rate, a logit needs a hundred to climb from an opacity of 0.01 to 0.5
 SPLIT_INTO = 2
 SPLIT_SHRINK = 1.6  # 0.8 x the number of parts: how much smaller a part is
 
@@ -50,11 +52,14 @@ class DensifySchedule:
 
 def densify_schedule(config: SplatConfig, steps: int, views: int) -> DensifySchedule:
     """Fractions of the run in steps; see the module's docstring for the floors."""
+    stop = round(config.densify_stop * steps)
+    few = min(max(views, stop // 10), PUBLISHED_EVERY)
+    recovery = min(max(RECOVERY_PASSES * views, RECOVERY_STEPS), PUBLISHED_RESET)
     return DensifySchedule(
         start=max(1, round(config.densify_start * steps), min(views, PUBLISHED_START)),
-        stop=round(config.densify_stop * steps),
-        every=max(1, round(config.densify_every * steps), min(views, PUBLISHED_EVERY)),
-        reset_every=max(1, round(config.reset_every * steps), min(RECOVERY_PASSES * views, PUBLISHED_RESET)),
+        stop=stop,
+        every=max(1, round(config.densify_every * steps), few),
+        reset_every=max(1, round(config.reset_every * steps), recovery),
     )
 
 
