@@ -154,11 +154,11 @@ BITS = {
     "residual_hyper": torch.tensor([20.0, 10.0]),
     "residual": torch.tensor([80.0, 240.0]),
 }
-ELEMENTS = {"reference_hyper": 8, "reference": 64, "covariance": 12, "residual_hyper": 20, "residual": 160}
+CHANNELS = {"reference_hyper": 4, "reference": 32, "covariance": 6, "residual_hyper": 10, "residual": 80}
 
 
 def test_the_rate_by_elements_adds_the_means_of_the_streams():
-    assert rate(BITS, ELEMENTS, "elements").item() == pytest.approx(
+    assert rate(BITS, CHANNELS, "elements").item() == pytest.approx(
         12 / 8 + 96 / 64 + 36 / 12 + 30 / 20 + 320 / 160
     )
 
@@ -166,15 +166,15 @@ def test_the_rate_by_elements_adds_the_means_of_the_streams():
 def test_the_rate_by_bits_weighs_every_bit_the_same():
     total = sum(b.sum().item() for b in BITS.values())
     # Two anchors of 132 elements.
-    assert rate(BITS, ELEMENTS, "bits").item() == pytest.approx(5 * total / (132 * 2))
+    assert rate(BITS, CHANNELS, "bits").item() == pytest.approx(5 * total / (132 * 2))
     leaves = {name: b.clone().requires_grad_() for name, b in BITS.items()}
-    rate(leaves, ELEMENTS, "bits").backward()
+    rate(leaves, CHANNELS, "bits").backward()
     assert {g.item() for b in leaves.values() for g in b.grad} == {leaves["residual"].grad[0].item()}
 
 
 def test_both_normalizations_are_equal_where_every_element_costs_the_same():
-    bits = {name: torch.tensor(1.7 * n) for name, n in ELEMENTS.items()}
-    by_bits, by_elements = (rate(bits, ELEMENTS, kind).item() for kind in ("bits", "elements"))
+    bits = {name: torch.tensor(1.7 * n) for name, n in CHANNELS.items()}
+    by_bits, by_elements = (rate(bits, CHANNELS, kind).item() for kind in ("bits", "elements"))
     assert by_bits == pytest.approx(by_elements) == pytest.approx(5 * 1.7)
 
 

@@ -20,7 +20,7 @@ PRESETS = ("default", "paper", "quick")
 class ModelConfig:
     """Hybrid primitives and their prediction (Sec. 3.1, 3.2)."""
 
-    coupled_primitives: int = 10  # K, per anchor (Sec. 3.4)
+    coupled_primitives: int = 5  # K, per anchor (10 in Sec. 3.4: slower, and no better at the same size)
     reference_dim: int = 32  # channels of a reference embedding (Sec. 3.4)
     residual_dim: int = 8  # channels of a residual embedding (Sec. 3.4)
     residuals: bool = True  # False: the K residual embeddings are the same for all anchors (ablation, Tab. 5)
@@ -45,14 +45,13 @@ class EntropyConfig:
         0.33  # quantization step of reference embeddings (1 in Sec. 3.4 costs 0.5 dB in short runs)
     )
     residual_step: float = 0.5  # quantization step of residual embeddings (1 in Sec. 3.4)
-    covariance_step: float = 0.05  # initial learned step of the anchors' log scales; 0.01 in the paper starts
-    #   on the likelihood floor in short runs
+    covariance_step: float = (
+        0.15  # initial learned step of the anchors' log scales (0.01 in Sec. 3.4: bits for what nobody sees)
+    )
     quantized: bool = True  # False: latents are trained unrounded, as a bound that no file reaches (ablation)
     network_hidden: int = 0  # hidden width of the entropy networks; 0: one linear layer (Ref.)
-    network_bits: int = (
-        13  # of the entropy networks' weights in the file: 0.1 % of the bits at 12, 0.006 % at 14
-    )
-    head_bits: int = 8  # of the prediction heads' weights in the file
+    network_bits: int = 10  # of the entropy networks' weights in the file; the run trains with them so rounded
+    head_bits: int = 7  # of the prediction heads' weights in the file
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class TrainingConfig:
     steps: int = 30_000  # one view each
     seed: int = 0
     lmbda: float = (
-        0.001  # weight of the rate; 0: the entropy networks learn what the latents cost, these do not care
+        0.004  # weight of the rate; 0: the entropy networks learn what the latents cost, these do not care
     )
     target_bytes: int | None = None  # size of the file to aim at: lambda, from its setting on, follows it
     rate: Literal["bits", "elements"] = (
@@ -86,6 +85,7 @@ class TrainingConfig:
     #   the paper; elements: sum over the tensors of mean bits per element (Ref.)
     rate_start: float = 0.1  # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
     ssim_weight: float = 0.2  # (1 - w) L1 + w (1 - SSIM) (3DGS)
+    revival_weight: float = 0.02  # keeps primitives that are not drawn from being lost
     scale_weight: float = 0.01  # mean product of the primitives' scales (Ref.)
     embedding_lr: tuple[float, float] = (0.05, 3e-4)  # quantization steps per training step, first and last
     log_scale_lr: tuple[float, float] = (0.007, 0.007)  # Ref.
@@ -93,6 +93,7 @@ class TrainingConfig:
     covariance_lr: tuple[float, float] = (4e-3, 4e-5)  # Ref.
     opacity_lr: tuple[float, float] = (2e-3, 2e-5)  # Ref.
     color_lr: tuple[float, float] = (8e-3, 8e-5)  # Ref.
+    schedule: Literal["cosine", "exponential"] = "cosine"  # of all these rates (Sec. 4.1; Ref.: exponential)
     head_warm_up: float = 0.05  # of the steps in which the heads come up to their learning rates
     entropy_lr: tuple[float, float] = (5e-3, 1e-4)  # Ref. 2e-4 -> 1e-5 hardly moves in short runs
     quantized_weights: float = (
@@ -103,6 +104,9 @@ class TrainingConfig:
     )
     appearance_dtype: Literal["float32", "bfloat16"] = (
         "float32"  # in which the networks of opacity and color compute; bfloat16 is meant for GPUs
+    )
+    hard_rate: float = (
+        0.8  # of the steps before the likelihood sees symbols in place of noise (soft then hard)
     )
     checkpoint_minutes: float = (
         5.0  # between two checkpoints; one is also written when the run is interrupted
@@ -207,6 +211,9 @@ def check_config(config: Config) -> None:
         ("training.ssim_weight", 0 <= t.ssim_weight <= 1, "0 to 1"),
         ("training.scale_weight", 0 <= t.scale_weight < 1e6, "0 or more"),
         ("training.quantized_weights", 0 <= t.quantized_weights <= 1, "0 to 1"),
+        ("training.revival_weight", 0 <= t.revival_weight <= 1, "0 to 1"),
+        ("training.schedule", t.schedule in ("cosine", "exponential"), "cosine or exponential"),
+        ("training.hard_rate", 0 <= t.hard_rate <= 1, "0 to 1"),
         ("training.head_warm_up", 0 <= t.head_warm_up <= 1, "0 to 1"),
         ("training.sparse_adam", isinstance(t.sparse_adam, bool), "true or false"),
         ("training.appearance_dtype", t.appearance_dtype in ("float32", "bfloat16"), "float32 or bfloat16"),

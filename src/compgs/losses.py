@@ -9,10 +9,10 @@ hyperpriors, and the covariance parameters. It can be normalized in two ways:
 - "elements", as the authors' release: the sum over the streams of their mean bits per element. A bit of a
   small stream weighs more than one of a large stream: twenty times for a hyperprior against the residual
   embeddings.
-- "bits": 5 * all bits / elements of all streams. Every bit weighs the same, as it does in the file. The
-  factor 5, the number of streams, makes lambda mean about the same as with "elements": with as many bits per
-  element in every stream, both are equal. With 32 + 6 + 80 + 4 + 10 = 132 elements an anchor,
-  R = 5 bits / (132 anchors).
+- "bits": R = 5 bits / (132 anchors). Every bit weighs the same, as it does in the file. Five streams and
+  32 + 6 + 80 + 4 + 10 = 132 elements an anchor are the paper's: with as many bits per element in every stream, both
+  normalizations are equal, so that lambda means about the same. The factor is a constant, so that lambda also means
+  the same whatever the dimensions of the model are.
 
 Bits themselves are counted in `entropy`; only this module divides them.
 """
@@ -93,22 +93,25 @@ def scale_regularizer(scales: Tensor, drawn: Tensor | None = None) -> Tensor:
 
 
 def revival_loss(opacities: Tensor) -> Tensor:
-    """Pulls the opacities [P] of primitives that are not drawn back to where they are.
+    """Pulls the opacities [P] of primitives that are hardly drawn, or not at all, back to where they are.
 
-    On an empty background, all opacities fall together before the references can tell the object from the air around
-    it; below the cutoff nothing would ever bring them back.
+    Below the cutoff nothing else would ever bring them back: many are lost in the first steps, and on an empty
+    background all of them, before the references can tell the object from the air around it.
     """
-    return 0.1 * torch.relu(REVIVED - opacities).mean()
+    return torch.relu(REVIVED - opacities).mean()
 
 
-def rate(bits: Mapping[str, Tensor], elements: Mapping[str, int], normalization: str) -> Tensor:
-    """R from the bits of each stream (any shape) and its number of elements; see the module's docstring."""
-    assert bits.keys() == elements.keys() and bits, f"bits of {list(bits)}, elements of {list(elements)}"
-    totals = {name: b.sum() for name, b in bits.items()}
+RATE_PER_BIT = 5.0 / 132.0  # of an anchor, with "bits"
+
+
+def rate(bits: Mapping[str, Tensor], channels: Mapping[str, int], normalization: str) -> Tensor:
+    """R from the bits [N] of each stream and its channels, elements an anchor; see the module's docstring."""
+    assert bits.keys() == channels.keys() and bits, f"bits of {list(bits)}, channels of {list(channels)}"
+    means = {name: b.mean() for name, b in bits.items()}
     if normalization == "elements":
-        return torch.stack([totals[name] / elements[name] for name in totals]).sum()
+        return torch.stack([means[name] / max(1, channels[name]) for name in means]).sum()
     assert normalization == "bits", f"unknown normalization {normalization!r}"
-    return len(totals) * torch.stack(list(totals.values())).sum() / sum(elements.values())
+    return RATE_PER_BIT * torch.stack(list(means.values())).sum()
 
 
 def rate_distortion_loss(distortion: Tensor, rate: Tensor, lmbda: float) -> Tensor:

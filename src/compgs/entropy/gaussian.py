@@ -93,8 +93,8 @@ def _torch_bits(x: Tensor, s: Tensor) -> Tensor:
 
 _f = np.float32
 _i = np.int32
-_FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
-_BLOCK = 2048  # elements in a pass: scratch memory stays in the first-level cache
+FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+BLOCK = 2048  # elements in a pass: scratch memory stays in the first-level cache
 
 # Constants of the kernels in single precision: one double among them would widen every vector.
 _HALF, _ONE, _ZERO = _f(0.5), _f(1.0), _f(0.0)
@@ -177,8 +177,8 @@ def _interval(x, s):
     return inverse, l, u, e_l, e_u, d
 
 
-@njit(fastmath=_FASTMATH, cache=True, error_model="numpy")
-def _element_bits(x, s, bits, d_x, d_s):
+@njit(fastmath=FASTMATH, cache=True, error_model="numpy")
+def element_bits(x, s, bits, d_x, d_s):
     """Bits and their derivatives; all flat. Kept apart from the parallel loop so that LLVM vectorizes it."""
     for i in range(np.uint64(x.size)):
         inverse, l, u, e_l, e_u, d = _interval(x[i], s[i])
@@ -190,7 +190,7 @@ def _element_bits(x, s, bits, d_x, d_s):
         bits[i] = _HALF_LOG2_E * l * l - _log2(d)
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=FASTMATH, cache=True)
 def _element_gradient(s, g, by_x, by_s, d_x, d_s):
     """Chain rule; all flat. A gradient that leads s away from the tables is dropped."""
     for i in range(np.uint64(s.size)):
@@ -200,19 +200,19 @@ def _element_gradient(s, g, by_x, by_s, d_x, d_s):
         d_s[i] = _ZERO if (s[i] > _TOP_F and d < _ZERO) else d
 
 
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
+@njit(parallel=True, fastmath=FASTMATH, cache=True)
 def _bits(x, s, channels, bits, by_x, by_s):
     """x, s flat [N * C] -> bits [N] and derivatives by_x, by_s, flat as x, or empty if not wanted."""
     N = len(bits)
-    rows = max(1, _BLOCK // max(channels, 1))
+    rows = max(1, BLOCK // max(channels, 1))
     for block in prange((N + rows - 1) // rows):
         scratch = np.empty((3, rows * channels), np.float32)
         first, last = block * rows, min(N, (block + 1) * rows)
         p, q = first * channels, last * channels
         if by_x.size > 0:
-            _element_bits(x[p:q], s[p:q], scratch[0], by_x[p:q], by_s[p:q])
+            element_bits(x[p:q], s[p:q], scratch[0], by_x[p:q], by_s[p:q])
         else:
-            _element_bits(x[p:q], s[p:q], scratch[0], scratch[1], scratch[2])
+            element_bits(x[p:q], s[p:q], scratch[0], scratch[1], scratch[2])
         for r in range(last - first):
             total = _ZERO
             for c in range(channels):
@@ -220,11 +220,11 @@ def _bits(x, s, channels, bits, by_x, by_s):
             bits[first + r] = total
 
 
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
+@njit(parallel=True, fastmath=FASTMATH, cache=True)
 def _bits_gradient(s, channels, g, by_x, by_s, d_x, d_s):
     """g [N], the gradient of the bits -> gradients d_x, d_s, flat [N * C] as s."""
     N = len(g)
-    rows = max(1, _BLOCK // max(channels, 1))
+    rows = max(1, BLOCK // max(channels, 1))
     for block in prange((N + rows - 1) // rows):
         scratch = np.empty(rows * channels, np.float32)
         first, last = block * rows, min(N, (block + 1) * rows)

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from compgs.config import EntropyConfig, ModelConfig
+from compgs.entropy.conditional import code_latents
 from compgs.entropy.factorized import FactorizedDensity
-from compgs.entropy.gaussian import gaussian_bits
 from compgs.entropy.network import NEGATIVE_SLOPE, OCTAVE, UNIT_SCALE, EntropyNetwork
-from compgs.entropy.quantization import quantize, round_straight_through
+from compgs.entropy.quantization import round_straight_through
 
 STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")
 
@@ -95,8 +95,9 @@ class EntropyModel(nn.Module):
         """Start the covariance prior at the data's mean and spread: from zero it would start without gradient."""
         network, step = self.covariance_network, self.covariance_step
         network.weights[-1].mul_(0.1)
-        network.biases[-1][:6] = log_scales.mean() / (step * network.gain[0])
-        network.biases[-1][6:] = (log_scales.std().clamp_min(0.1) / step).log2()
+        channels = network.channels
+        network.biases[-1][:channels] = log_scales.mean() / (step * network.gain[0])
+        network.biases[-1][channels:] = (log_scales.std().clamp_min(0.1) / step).log2()
 
     def starting_residuals(self) -> Tensor:
         """[K * residual_dim] residual embedding that a new anchor starts with, in quantization steps."""
@@ -130,23 +131,23 @@ class EntropyModel(nn.Module):
         file). `network_bits`: the networks' weights as the file will hold them.
         """
         z_f = self.reference_analysis(references)
-        mean_f, scale_f = self.reference_network(round_straight_through(z_f), network_bits)
-        f_hat = quantize(references, mean_f)
-        mean_c, scale_c = self.covariance_network(f_hat, network_bits)
-        c_hat = quantize(covariances, mean_c)
+        options = {"rate": rate, "noise": noise, "network_bits": network_bits}
+        f_hat, bits_f = code_latents(
+            references, round_straight_through(z_f), self.reference_network, **options
+        )
+        c_hat, bits_c = code_latents(covariances, f_hat, self.covariance_network, **options)
         z_g = self.residual_analysis(residuals)
         context = torch.cat([round_straight_through(z_g), f_hat], 1)
-        mean_g, scale_g = self.residual_network(context, network_bits)
-        g_hat = quantize(residuals, mean_g)
-        bits: dict[str, Tensor] = {}
-        if rate:
-            bits = {
-                "reference_hyper": _hyper_bits(self.reference_density, z_f, noise),
-                "reference": gaussian_bits(_relax(references - mean_f, noise), scale_f),
-                "covariance": gaussian_bits(_relax(covariances - mean_c, noise), scale_c),
-                "residual_hyper": _hyper_bits(self.residual_density, z_g, noise),
-                "residual": _coded_bits(_relax(residuals - mean_g, noise), scale_g, mask),
-            }
+        g_hat, bits_g = code_latents(residuals, context, self.residual_network, mask=mask, **options)
+        if not rate:
+            return Quantized(f_hat, c_hat, g_hat, {})
+        bits = {
+            "reference_hyper": _hyper_bits(self.reference_density, z_f, noise),
+            "reference": bits_f,
+            "covariance": bits_c,
+            "residual_hyper": _hyper_bits(self.residual_density, z_g, noise),
+            "residual": bits_g,
+        }
         return Quantized(f_hat, c_hat, g_hat, bits)
 
 
@@ -157,21 +158,10 @@ def _hyper_bits(density: FactorizedDensity, z: Tensor, noise: Callable[[Tensor],
     """
     if noise is not None:
         return density.bits(z + noise(z))
-    bits = torch.zeros_like(z[:, 0])
+    if z.requires_grad:  # training with symbols: a histogram has no gradient
+        return density.bits(round_straight_through(z))
+    bits = z.new_zeros(len(z))
     for symbols in z.round().to(torch.int64).unbind(1):
         _, inverse, counts = torch.unique(symbols, return_inverse=True, return_counts=True)
         bits -= torch.log2(counts / len(symbols))[inverse]
     return bits
-
-
-def _coded_bits(x: Tensor, scale: Tensor, mask: Tensor | None) -> Tensor:
-    """[N] bits of the residual embeddings of those coupled primitives that are coded."""
-    if mask is None:
-        return gaussian_bits(x, scale)
-    slots = mask.numel()
-    bits = gaussian_bits(x.reshape(slots, -1), scale.reshape(slots, -1)).view_as(mask)
-    return (bits * mask).sum(1)
-
-
-def _relax(x: Tensor, noise: Callable[[Tensor], Tensor] | None) -> Tensor:
-    return x.round() if noise is None else x + noise(x)

@@ -67,16 +67,17 @@ class EntropyNetwork(nn.Module):
             result.append((weight, bias))
         return result
 
+    def inputs_of_last(self, x: Tensor, bits: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """x [N, inputs] through all layers but the last; then the last one's weight [2 C, in] and bias [2 C]."""
+        *hidden, (weight, bias) = self.layers(bits)
+        for hidden_weight, hidden_bias in hidden:
+            y = torch.addmm(hidden_bias, x, hidden_weight.t())
+            x = nn.functional.leaky_relu(y if bits is None else round_fixed(y), NEGATIVE_SLOPE)
+        return x, weight, bias
+
     def forward(self, x: Tensor, bits: int | None = None) -> tuple[Tensor, Tensor]:
         """x [N, inputs] -> means [N, C] in quantization steps, scale indices [N, C] (see entropy.gaussian)."""
-
-        def affine(weight: Tensor, bias: Tensor) -> Tensor:
-            y = torch.addmm(bias, x, weight.t())
-            return y if bits is None else round_fixed(y)
-
-        *hidden, (weight, bias) = self.layers(bits)
-        for layer in hidden:
-            x = nn.functional.leaky_relu(affine(*layer), NEGATIVE_SLOPE)
-        # Means and scales by one product each: halves of one matrix would have to be copied, in both directions.
-        c = self.channels
-        return affine(weight[:c], bias[:c]), affine(weight[c:], bias[c:])
+        x, weight, bias = self.inputs_of_last(x, bits)
+        y = torch.addmm(bias, x, weight.t())
+        mean, scale = (y if bits is None else round_fixed(y)).chunk(2, 1)
+        return mean, scale

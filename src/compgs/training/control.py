@@ -138,7 +138,11 @@ class AdaptiveControl:
             taken = torch.cat([taken, chosen[:room]])
             room -= len(chosen[:room])
         new = sum(len(x) for x in grown["coordinates"])
-        empty = {"coordinates": (0, 3), "references": (0, m.reference_dim), "log_scales": (0, 6)}
+        empty = {
+            "coordinates": (0, 3),
+            "references": (0, m.reference_dim),
+            "log_scales": (0, 6),
+        }
         rows = {name: torch.cat([*parts, means.new_zeros(empty[name])]) for name, parts in grown.items()}
         return {
             "coordinates": rows["coordinates"].to(torch.int32),

@@ -1,7 +1,7 @@
 """Adam over the scene's parameters: one group a learning rate, log-linear decay, rows that come and go (Sec. 3.4)."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
@@ -41,19 +41,36 @@ def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.A
     return torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
 
 
-def set_learning_rates(optimizer: torch.optim.Optimizer, progress: float, warm_up: float = 0.0) -> None:
-    """Log-linear from the first to the last rate of each group; `progress` in 0..1.
+def set_learning_rates(
+    optimizer: torch.optim.Optimizer,
+    progress: float,
+    decay: Callable[[float, float, float], float],
+    warm_up: float = 0.0,
+) -> None:
+    """From the first to the last rate of each group; `progress` in 0..1.
 
-    In the first `warm_up` of the run the prediction heads come up to their rates from a hundredth of them: at full rate
-    they would make the whole scene transparent or white, where nothing has a gradient, before the embeddings can tell
-    one place from another.
+    In the first `warm_up` of the run the prediction heads come up to their rates from a hundredth of them: at full
+    rate they would make the whole scene transparent or white, where nothing has a gradient, before the embeddings can
+    tell one place from another.
     """
     rising = min(1.0, 0.01 + progress / warm_up) if warm_up > 0 else 1.0
     for group in optimizer.param_groups:
-        first, last = group["rates"]
-        group["lr"] = first * math.exp(progress * math.log(last / first))
+        group["lr"] = decay(*group["rates"], progress)
         if group["name"] in HEAD_GROUPS:
             group["lr"] *= rising
+
+
+def cosine_decay(first: float, last: float, progress: float) -> float:
+    """Half a cosine from the first to the last rate."""
+    return last + (first - last) * 0.5 * (1.0 + math.cos(math.pi * progress))
+
+
+def exponential_decay(first: float, last: float, progress: float) -> float:
+    """By the same factor in every step."""
+    return first * math.exp(progress * math.log(last / first))
+
+
+DECAYS = {"cosine": cosine_decay, "exponential": exponential_decay}
 
 
 @torch.no_grad()

@@ -30,7 +30,7 @@ from compgs.training.checkpoint import (
 )
 from compgs.training.densification import DensityControl, densify_schedule
 from compgs.training.loop import StepResult, TrainingStatus, next_view, run_to_end
-from compgs.training.optimizers import set_learning_rates
+from compgs.training.optimizers import exponential_decay, set_learning_rates
 from compgs.training.profile import NoProfile, StepProfile
 from compgs.training.splat_parameters import (
     SplatParameters,
@@ -140,7 +140,7 @@ class SplatTrainer:
         loss.backward()
         profile.lap("activation and harmonics, backward")
 
-        set_learning_rates(self.optimizer, self.step / self.config.training.steps)
+        set_learning_rates(self.optimizer, self.step / self.config.training.steps, exponential_decay)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         profile.lap("optimizer")

@@ -40,12 +40,10 @@ from compgs.training.checkpoint import (
 )
 from compgs.training.control import AdaptiveControl, make_schedule
 from compgs.training.loop import StepResult, TrainingStatus, next_view, run_to_end
-from compgs.training.optimizers import make_optimizer, set_learning_rates, step_rows
+from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rates, step_rows
 from compgs.training.profile import NoProfile, StepProfile
 from compgs.training.rate_control import RateState, due, follow
 
-# With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
-FEW_DRAWN = 0.1
 POSITION_BITS = 10.0  # bits per anchor position, for the estimate only
 OTHER_BYTES = 400  # scene, tables, metadata, container, for the estimate only
 SHARES = 10  # looks in a run at how much the last step drops, where the size is controlled
@@ -132,7 +130,10 @@ class Trainer:
             return self.skip(view)
         profile.lap("culling")
         latents = self.model.quantized(
-            rows, rate=progress >= t.rate_start, noise=self.noise, stored_weights=stored
+            rows,
+            rate=progress >= t.rate_start,
+            noise=self.noise if progress < t.hard_rate else None,
+            stored_weights=stored,
         )
         profile.lap("entropy")
         prediction = self.predict(latents, rows, view.camera, stored)
@@ -144,11 +145,10 @@ class Trainer:
             rendered.means2d.retain_grad()
         distortion = photometric_loss(rendered.image, self.target(view_index), t.ssim_weight)
         loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales, prediction.drawn)
-        loss = loss + self.revival(prediction)
+        loss = loss + t.revival_weight * revival_loss(prediction.opacities)
         profile.lap("loss")
         if latents.bits:
-            elements = self.elements(len(rows))
-            r = rate(latents.bits, elements, t.rate)
+            r = rate(latents.bits, self.channels(), t.rate)
             if self.rate.lmbda > 0:
                 loss = rate_distortion_loss(loss, r, self.rate.lmbda)
             else:
@@ -165,7 +165,7 @@ class Trainer:
         loss.backward()
         profile.lap("entropy, backward")
 
-        set_learning_rates(self.optimizer, progress, t.head_warm_up)
+        set_learning_rates(self.optimizer, progress, DECAYS[t.schedule], t.head_warm_up)
         if t.sparse_adam:
             step_rows(self.model, self.optimizer, rows)
         self.optimizer.step()
@@ -184,15 +184,6 @@ class Trainer:
         self.step += 1
         self.control_rate()
         return StepResult(loss.detach(), rendered.image.detach(), view)
-
-    def revival(self, prediction: Prediction) -> Tensor | float:
-        """The loss that keeps a scene of which hardly anything is drawn from vanishing; 0 otherwise."""
-        if prediction.drawn is not None:
-            few = prediction.drawn.float().mean() < FEW_DRAWN
-            return torch.where(few, revival_loss(prediction.opacities), 0.0)
-        if len(prediction.index) < FEW_DRAWN * len(prediction.opacities):
-            return revival_loss(prediction.opacities)
-        return 0.0
 
     def skip(self, view: View) -> StepResult:
         """A step on a view that no anchor is in: nothing can be learned from it."""
@@ -230,17 +221,16 @@ class Trainer:
             appearance_dtype=getattr(torch, self.config.training.appearance_dtype),
         )
 
-    def elements(self, anchors: int) -> dict[str, int]:
-        """Number of coded symbols of each stream for so many anchors."""
+    def channels(self) -> dict[str, int]:
+        """Coded symbols of each stream, of an anchor."""
         m, e = self.config.model, self.config.entropy
-        channels = {
+        return {
             "reference_hyper": e.reference_hyper_dim,
             "reference": m.reference_dim,
             "covariance": 6,
             "residual_hyper": e.residual_hyper_dim,
             "residual": m.coupled_primitives * m.residual_dim,
         }
-        return {name: anchors * n for name, n in channels.items()}
 
     @torch.no_grad()
     def coupled_means(self) -> Tensor:
