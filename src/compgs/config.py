@@ -50,7 +50,9 @@ class EntropyConfig:
     )
     quantized: bool = True  # False: latents are trained unrounded, as a bound that no file reaches (ablation)
     network_hidden: int = 0  # hidden width of the entropy networks; 0: one linear layer (Ref.)
-    network_bits: int = 10  # of the entropy networks' weights in the file; the run trains with them so rounded
+    network_bits: int = (
+        10  # of the entropy networks' weights in the file; the run trains with them so rounded
+    )
     head_bits: int = 7  # of the prediction heads' weights in the file
 
 

@@ -146,7 +146,7 @@ def test_no_rows_and_strided_inputs_are_taken():
 
 def test_the_kernel_is_compiled_to_vector_instructions():
     """Losing them is silent otherwise, and costs a factor of five."""
-    kernel = gaussian._element_bits
+    kernel = gaussian.element_bits
     fresh = njit(kernel.py_func, **{k: v for k, v in kernel.targetoptions.items() if k != "nopython"})
     fresh(*[np.ones(4, np.float32) for _ in range(5)])
     (code,) = fresh.inspect_llvm().values()

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -51,9 +53,10 @@ def test_the_prior_of_the_covariance_starts_at_the_data(entropy):
     before = entropy(torch.zeros(500, 6), y, torch.zeros(500, 12), rate=True).bits["covariance"].mean()
     entropy.fit_covariance_prior(log_scales)
     after = entropy(torch.zeros(500, 6), y, torch.zeros(500, 12), rate=True).bits["covariance"].mean()
-    # 6 Gaussians of 0.7 natural units in steps of 0.05: log2(14 sqrt(2 pi e)) = 5.85 bits each.
+    # 6 Gaussians of 0.7 natural units in steps: log2(0.7 / step sqrt(2 pi e)) bits each.
+    expected = 6 * math.log2(0.7 / ENTROPY.covariance_step * math.sqrt(2 * math.pi * math.e))
     assert after < before
-    assert float(after.detach()) == pytest.approx(6 * 5.85, rel=0.05)
+    assert float(after.detach()) == pytest.approx(expected, rel=0.05)
 
 
 def test_minimizing_the_bits_lets_the_networks_find_a_dependence(entropy):
@@ -81,3 +84,14 @@ def test_minimizing_the_bits_lets_the_networks_find_a_dependence(entropy):
         bits.backward()
         optimizer.step()
     assert last < 0.5 * first
+
+
+def test_without_noise_training_sees_the_density_at_the_symbols_and_has_gradients(entropy):
+    """The end of a training: a histogram, which counts symbols, would have none."""
+    latents = [torch.randn(40, n).requires_grad_() for n in (6, 6, 12)]
+    bits = entropy(*latents, rate=True).bits
+    symbols = entropy.reference_analysis(latents[0]).round()
+    torch.testing.assert_close(bits["reference_hyper"], entropy.reference_density.bits(symbols))
+    torch.stack([b.sum() for b in bits.values()]).sum().backward()
+    assert all(float(y.grad.abs().sum()) > 0 for y in latents)
+    assert float(entropy.residual_density.logits.grad.abs().sum()) > 0

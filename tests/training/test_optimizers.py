@@ -1,12 +1,20 @@
-"""Adam for the anchors in view."""
+"""Adam for the anchors in view, and how learning rates fall."""
 
+import itertools
 from dataclasses import replace
 
 import numba
 import pytest
 import torch
 
-from compgs.training.optimizers import ANCHOR_PARAMETERS, adam_rows, make_optimizer, step_rows
+from compgs.training.optimizers import (
+    ANCHOR_PARAMETERS,
+    DECAYS,
+    adam_rows,
+    make_optimizer,
+    set_learning_rates,
+    step_rows,
+)
 from compgs.training.trainer import Trainer, initial_model
 
 CPU = torch.device("cpu")
@@ -106,3 +114,34 @@ def test_a_run_with_sparse_adam_learns(blob_scene, tiny_config):
     trainer = Trainer(blob_scene, config, CPU)
     losses = [float(trainer.train_step().loss) for _ in range(100)]
     assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
+
+
+def rates(decay: str, warm_up: float = 0.0) -> list[list[float]]:
+    """Learning rates of two groups, "references" and "geometry", at five places of a run."""
+    parameters = [torch.nn.Parameter(torch.zeros(1)) for _ in range(2)]
+    optimizer = torch.optim.Adam(
+        [
+            {"name": "references", "params": parameters[:1], "rates": (0.1, 0.001)},
+            {"name": "geometry", "params": parameters[1:], "rates": (0.01, 0.01)},
+        ]
+    )
+    found = []
+    for progress in (0.0, 0.25, 0.5, 0.75, 1.0):
+        set_learning_rates(optimizer, progress, DECAYS[decay], warm_up)
+        found.append([group["lr"] for group in optimizer.param_groups])
+    return found
+
+
+def test_the_cosine_falls_by_half_in_the_middle_and_the_exponential_by_the_same_factor_everywhere():
+    cosine = [a for a, _ in rates("cosine")]
+    assert cosine[0] == pytest.approx(0.1)
+    assert cosine[2] == pytest.approx((0.1 + 0.001) / 2)
+    assert cosine[4] == pytest.approx(0.001)
+    exponential = [a for a, _ in rates("exponential")]
+    assert all(b / a == pytest.approx(10**-0.5) for a, b in itertools.pairwise(exponential))
+
+
+def test_only_heads_warm_up():
+    warmed, cold = rates("cosine", warm_up=0.5), rates("cosine")
+    assert [a for a, _ in warmed] == [a for a, _ in cold]
+    assert [b for _, b in warmed] == pytest.approx([0.0001, 0.0051, 0.01, 0.01, 0.01])

@@ -30,8 +30,8 @@ def code_latents(
     noise: Noise | None = None,
     network_bits: int | None = None,
     mask: Tensor | None = None,  # [N, K] bool: slots of C / K channels that are coded; default all
-) -> tuple[Tensor, Tensor | None]:
-    """y_hat [N, C], and the bits [N] of each row if `rate`.
+) -> tuple[Tensor, Tensor]:
+    """y_hat [N, C], and the bits [N] of each row; [0] if not `rate`.
 
     With `noise` the likelihood sees y - mean with uniform noise (training), without it the symbol itself.
     `network_bits`: the network's weights as the file will hold them.
@@ -41,12 +41,12 @@ def code_latents(
     if y.device.type == "cpu" and y.dtype == inputs.dtype == torch.float32:
         uniform = noise(y) if rate and noise is not None else None
         y_hat, bits = _Coded.apply(y, inputs, weight, bias, uniform, rate, fixed, mask)
-        return y_hat, bits if rate else None
+        return y_hat, bits
     out = torch.addmm(bias, inputs, weight.t())
     mean, scale = (round_fixed(out) if fixed else out).chunk(2, 1)
     y_hat = quantize(y, mean)
     if not rate:
-        return y_hat, None
+        return y_hat, y.new_empty(0)
     x = y - mean
     x = x + noise(x) if noise is not None else round_straight_through(x)
     if mask is None:

@@ -7,6 +7,7 @@ primitives, flattened; `z` hyperpriors. All latents are in units of their quanti
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -131,14 +132,12 @@ class EntropyModel(nn.Module):
         file). `network_bits`: the networks' weights as the file will hold them.
         """
         z_f = self.reference_analysis(references)
-        options = {"rate": rate, "noise": noise, "network_bits": network_bits}
-        f_hat, bits_f = code_latents(
-            references, round_straight_through(z_f), self.reference_network, **options
-        )
-        c_hat, bits_c = code_latents(covariances, f_hat, self.covariance_network, **options)
+        code = partial(code_latents, rate=rate, noise=noise, network_bits=network_bits)
+        f_hat, bits_f = code(references, round_straight_through(z_f), self.reference_network)
+        c_hat, bits_c = code(covariances, f_hat, self.covariance_network)
         z_g = self.residual_analysis(residuals)
         context = torch.cat([round_straight_through(z_g), f_hat], 1)
-        g_hat, bits_g = code_latents(residuals, context, self.residual_network, mask=mask, **options)
+        g_hat, bits_g = code(residuals, context, self.residual_network, mask=mask)
         if not rate:
             return Quantized(f_hat, c_hat, g_hat, {})
         bits = {

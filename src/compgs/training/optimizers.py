@@ -55,7 +55,8 @@ def set_learning_rates(
     """
     rising = min(1.0, 0.01 + progress / warm_up) if warm_up > 0 else 1.0
     for group in optimizer.param_groups:
-        group["lr"] = decay(*group["rates"], progress)
+        first, last = group["rates"]
+        group["lr"] = decay(first, last, progress)
         if group["name"] in HEAD_GROUPS:
             group["lr"] *= rising
 
