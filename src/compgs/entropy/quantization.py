@@ -5,7 +5,6 @@ value that the decoder will have. Rendering sees rounded values with a straight-
 values with uniform noise (Ballé et al. 2017); both as in the authors' release.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -73,20 +72,25 @@ class UniformNoise:
 
 def weight_exponent(weight: Tensor, bits: int) -> int:
     """Largest e in 0..24 for which round(weight * 2^e) fits into `bits` signed bits."""
-    largest = float(weight.detach().abs().max()) if weight.numel() else 0.0
+    return int(_weight_exponent(weight, bits))
+
+
+def _weight_exponent(weight: Tensor, bits: int) -> Tensor:
+    """[] float64; stays on the weight's device, as reading it would wait for a GPU in every step."""
+    if not weight.numel():
+        return torch.zeros((), dtype=torch.float64, device=weight.device)
+    largest = weight.detach().abs().max().double()
     limit = (1 << (bits - 1)) - 1
-    if not 0.0 < largest < math.inf:
-        return 0  # (the loss says so if a training has diverged)
-    exponent = math.floor(math.log2(limit / largest))
-    while exponent > 0 and round(largest * 2.0**exponent) > limit:
-        exponent -= 1
-    return max(0, min(24, exponent))
+    exponent = torch.floor(torch.log2(limit / largest))
+    exponent = torch.where(torch.round(largest * torch.exp2(exponent)) > limit, exponent - 1.0, exponent)
+    # Zero, and what is not finite (the loss says so if a training has diverged), count as 0.
+    usable = (largest > 0.0) & torch.isfinite(largest)
+    return torch.where(usable, exponent.clamp(0.0, 24.0), torch.zeros_like(exponent))
 
 
 def quantize_weight(weight: Tensor, bits: int) -> Tensor:
     """The weight as the file will hold it (an integer of `bits` bits times a power of two), straight-through."""
-    exponent = weight_exponent(weight, bits)
+    step = torch.exp2(-_weight_exponent(weight, bits)).to(weight.dtype)
     limit = (1 << (bits - 1)) - 1
-    step = 2.0**-exponent
     stored = (weight.detach() / step).round().clamp_(-limit, limit) * step
     return weight + (stored - weight).detach()
