@@ -87,7 +87,6 @@ class TrainingConfig:
     #   the paper; elements: sum over the tensors of mean bits per element (Ref.)
     rate_start: float = 0.1  # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
     ssim_weight: float = 0.2  # (1 - w) L1 + w (1 - SSIM) (3DGS)
-    revival_weight: float = 0.02  # keeps primitives that are not drawn from being lost
     scale_weight: float = 0.01  # mean product of the primitives' scales (Ref.)
     embedding_lr: tuple[float, float] = (0.05, 3e-4)  # quantization steps per training step, first and last
     log_scale_lr: tuple[float, float] = (0.007, 0.007)  # Ref.
@@ -213,7 +212,6 @@ def check_config(config: Config) -> None:
         ("training.ssim_weight", 0 <= t.ssim_weight <= 1, "0 to 1"),
         ("training.scale_weight", 0 <= t.scale_weight < 1e6, "0 or more"),
         ("training.quantized_weights", 0 <= t.quantized_weights <= 1, "0 to 1"),
-        ("training.revival_weight", 0 <= t.revival_weight <= 1, "0 to 1"),
         ("training.schedule", t.schedule in ("cosine", "exponential"), "cosine or exponential"),
         ("training.hard_rate", 0 <= t.hard_rate <= 1, "0 to 1"),
         ("training.head_warm_up", 0 <= t.head_warm_up <= 1, "0 to 1"),

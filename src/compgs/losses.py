@@ -93,12 +93,12 @@ def scale_regularizer(scales: Tensor, drawn: Tensor | None = None) -> Tensor:
 
 
 def revival_loss(opacities: Tensor) -> Tensor:
-    """Pulls the opacities [P] of primitives that are hardly drawn, or not at all, back to where they are.
+    """Pulls the opacities [P] of primitives that are not drawn back to where they are.
 
-    Below the cutoff nothing else would ever bring them back: many are lost in the first steps, and on an empty
-    background all of them, before the references can tell the object from the air around it.
+    On an empty background, all opacities fall together before the references can tell the object from the air around
+    it; below the cutoff nothing would ever bring them back.
     """
-    return torch.relu(REVIVED - opacities).mean()
+    return 0.1 * torch.relu(REVIVED - opacities).mean()
 
 
 RATE_PER_BIT = 5.0 / 132.0  # of an anchor, with "bits"

@@ -44,6 +44,8 @@ from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rate
 from compgs.training.profile import NoProfile, StepProfile
 from compgs.training.rate_control import RateState, due, follow
 
+# With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
+FEW_DRAWN = 0.1
 POSITION_BITS = 10.0  # bits per anchor position, for the estimate only
 OTHER_BYTES = 400  # scene, tables, metadata, container, for the estimate only
 SHARES = 10  # looks in a run at how much the last step drops, where the size is controlled
@@ -145,7 +147,7 @@ class Trainer:
             rendered.means2d.retain_grad()
         distortion = photometric_loss(rendered.image, self.target(view_index), t.ssim_weight)
         loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales, prediction.drawn)
-        loss = loss + t.revival_weight * revival_loss(prediction.opacities)
+        loss = loss + self.revival(prediction)
         profile.lap("loss")
         if latents.bits:
             r = rate(latents.bits, self.channels(), t.rate)
@@ -184,6 +186,15 @@ class Trainer:
         self.step += 1
         self.control_rate()
         return StepResult(loss.detach(), rendered.image.detach(), view)
+
+    def revival(self, prediction: Prediction) -> Tensor | float:
+        """The loss that keeps a scene of which hardly anything is drawn from vanishing; 0 otherwise."""
+        if prediction.drawn is not None:
+            few = prediction.drawn.float().mean() < FEW_DRAWN
+            return torch.where(few, revival_loss(prediction.opacities), 0.0)
+        if len(prediction.index) < FEW_DRAWN * len(prediction.opacities):
+            return revival_loss(prediction.opacities)
+        return 0.0
 
     def skip(self, view: View) -> StepResult:
         """A step on a view that no anchor is in: nothing can be learned from it."""
