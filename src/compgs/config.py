@@ -68,6 +68,9 @@ class ControlConfig:
     opacity_threshold: float = (
         5e-4  # anchors with less opacity, summed over K, averaged over views, are removed
     )
+    idle_share: float = (
+        0.002  # of all blending weights in training views: what adds no more is left out of the file
+    )
     growth_probability: float = 0.5  # a candidate of level l is kept with probability p^(l + 1)
 
 
@@ -224,6 +227,7 @@ def check_config(config: Config) -> None:
         ("control.gradient_threshold", 0 < c.gradient_threshold < 1e6, "above 0"),
         ("control.minimum_views", 0 <= c.minimum_views < 1 << 31, "0 or more"),
         ("control.opacity_threshold", 0 <= c.opacity_threshold < 1e3, "0 or more"),
+        ("control.idle_share", 0 <= c.idle_share < 1, "0 or more, below 1"),
         ("control.growth_probability", 0 <= c.growth_probability <= 1, "0 to 1"),
         ("splats.harmonics", 0 <= s.harmonics <= 3, "0 to 3"),
         ("splats.harmonics_every", 0 <= s.harmonics_every <= 1, "0 to 1"),

@@ -10,7 +10,7 @@ from compgs.metrics import psnr, to_8bit
 from compgs.render import RasterSettings, rasterize, render
 from compgs.scene.views import View
 from compgs.training import train
-from compgs.training.trainer import Trainer
+from compgs.training.trainer import Trainer, worth_keeping
 
 CPU = torch.device("cpu")
 
@@ -171,3 +171,16 @@ def test_unquantized_latents_are_rendered_as_they_are(blob_scene, tiny_config):
     assert torch.equal(shown.references, model.references.detach() * step)
     flat = model.residuals.detach().view(len(kept), -1)
     assert torch.equal(shown.residuals, flat[kept] * config.entropy.residual_step)
+
+
+def test_primitives_that_add_least_are_left_out_up_to_their_share():
+    """Against a sum in exact order, on random contributions, some of them zero."""
+    g = np.random.default_rng(0)
+    for share in (0.0, 0.002, 0.3):
+        contributions = g.exponential(1.0, 200) * (g.random(200) > 0.2)
+        kept = worth_keeping(torch.from_numpy(contributions), share).numpy()
+        assert contributions[~kept].sum() <= share * contributions.sum() + 1e-9
+        smallest = contributions[kept].min()
+        assert (contributions[~kept] <= smallest).all()
+        assert contributions[~kept].sum() + smallest > share * contributions.sum()
+        assert not kept[contributions == 0].any()

@@ -24,8 +24,8 @@ from compgs.losses import (
     revival_loss,
     scale_regularizer,
 )
-from compgs.model.prediction import OPACITY_CUTOFF, Prediction, camera_center, choosing_pays, predict
-from compgs.render import RasterSettings, rasterize, visible_mask
+from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
+from compgs.render import RasterSettings, contributions, rasterize, visible_mask
 from compgs.scene.points import median_spacing, voxel_grid
 from compgs.scene.views import Scene, View
 from compgs.trained_model import BIAS_BITS, TrainedModel
@@ -320,22 +320,25 @@ class Trainer:
         return share
 
     def finish(self) -> None:
-        """Drop coupled primitives that no training view ever sees, and anchors that have none left."""
+        """Drop coupled primitives that training views hardly see, or not at all, and anchors that have none left."""
         self.model.mask = self.seen()
         if not self.model.mask.any():
             raise TrainingError("no primitive is visible in any training view; the run has failed")
 
     @torch.no_grad()
     def seen(self) -> Tensor:
-        """[N, K] bool: coupled primitives that some training view sees."""
+        """[N, K] bool: coupled primitives that the training views would miss."""
         model, k = self.model, self.config.model.coupled_primitives
-        opacity = torch.zeros(model.anchors, k, device=self.device)
+        total = torch.zeros(model.anchors * k, dtype=torch.float64, device=self.device)
         for view in self.scene.train_views:
             rows = self.visible_anchors(view.camera)
-            latents = model.quantized(rows)
-            seen = self.predict(latents, rows, view.camera, stored=True).opacities.view(-1, k)
-            opacity[rows] = torch.maximum(opacity[rows], seen)
-        return opacity > OPACITY_CUTOFF
+            if len(rows) == 0:
+                continue
+            prediction = self.predict(model.quantized(rows), rows, view.camera, stored=True)
+            slots = rows[prediction.index // k] * k + prediction.index % k
+            # Each slot comes once: no sum depends on an order.
+            total[slots] += contributions(prediction.gaussians, view.camera, self.settings).double()
+        return worth_keeping(total, self.config.control.idle_share).view(-1, k)
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
@@ -378,6 +381,15 @@ def gaussian_entropy(values: Tensor) -> float:
     """Bits of values that are rounded to integers and coded as if from one Gaussian of their spread."""
     variance = float(values.detach().double().var(correction=0)) + 1 / 12  # of the rounding
     return values.numel() * max(0.0, 0.5 * math.log2(2 * math.pi * math.e * variance))
+
+
+def worth_keeping(contributions: Tensor, idle_share: float) -> Tensor:
+    """[P] bool: all but the smallest contributions [P], which together make up at most `idle_share` of the sum."""
+    ascending = contributions.sort(stable=True)
+    idle = ascending.values.cumsum(0) <= idle_share * contributions.sum()
+    kept = contributions > 0
+    kept[ascending.indices[idle]] = False
+    return kept
 
 
 def initial_model(scene: Scene, config: Config) -> TrainedModel:
