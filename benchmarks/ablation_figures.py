@@ -104,4 +104,4 @@ def draw_bits(axes: Any, rows: Sequence[Row]) -> None:
     axes.bar([p + 0.2 for p in places], [b[1] for b in both], 0.4, label="coupled primitive")
     axes.set_xticks(list(places), [row.label for row in rows], fontsize=7)
     axes.set_ylabel("bits each")
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.18))

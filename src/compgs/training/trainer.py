@@ -47,7 +47,7 @@ from compgs.training.rate_control import RateState, due, follow
 # With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
 FEW_DRAWN = 0.1
 POSITION_BITS = 10.0  # bits per anchor position, for the estimate only
-OTHER_BYTES = 400  # scene, tables, metadata, container, for the estimate only
+OTHER_BYTES = 750  # names of tensors, scene, tables, metadata, container, for the estimate only
 SHARES = 10  # looks in a run at how much the last step drops, where the size is controlled
 
 
@@ -288,13 +288,16 @@ class Trainer:
     def fixed_bytes(self) -> int:
         """Of the networks and all that does not grow with the scene, about: no lambda makes it smaller."""
         e, model = self.config.entropy, self.model
-        bits = sum(
-            coded_weight_bits(p, e.head_bits if p.dim() > 1 else BIAS_BITS) for p in model.heads.parameters()
-        )
+        bits = 0.0
+        for p in model.heads.parameters():
+            exponent = weight_exponent(p, e.head_bits if p.dim() > 1 else BIAS_BITS)
+            bits += gaussian_entropy(p * 2.0**exponent)
         for network in model.entropy.coded_networks:
             for weight, bias in network.layers():
-                bits += coded_weight_bits(weight, e.network_bits)
-                bits += gaussian_entropy(bias * 2.0**FRACTION_BITS)
+                scaled = weight * 2.0 ** weight_exponent(weight, e.network_bits)
+                # In halves, as the file has them: means and scales differ in spread.
+                bits += sum(gaussian_entropy(half) for half in scaled.tensor_split(2))
+                bits += sum(gaussian_entropy(half * 2.0**FRACTION_BITS) for half in bias.tensor_split(2))
         return int(bits / 8) + OTHER_BYTES
 
     def control_rate(self) -> None:
@@ -370,11 +373,6 @@ class Trainer:
         trainer.step = checkpoint.state["step"]
         trainer.rate = RateState(**checkpoint.state["rate"])
         return trainer
-
-
-def coded_weight_bits(weight: Tensor, bits: int) -> float:
-    """Of a network's weights in the file, where they are integers of so many bits."""
-    return gaussian_entropy(weight * 2.0 ** weight_exponent(weight, bits))
 
 
 def gaussian_entropy(values: Tensor) -> float:
