@@ -1,4 +1,4 @@
-# make demo   a scene is made, trained, encoded, and its file decoded and judged in a new process: about five minutes
+# make demo   a scene is made, trained, encoded, and its file decoded and judged in a new process: about three minutes
 # make test   the test suite
 # make lint   style and types
 # Needs python3 (3.11 or later) and make; everything else is installed into .venv in this folder.
