@@ -11,7 +11,7 @@ from compgs.export import read_ply, write_ply
 from compgs.export.ply import ply_size, read_ply_header
 from compgs.model.splats import Splats
 
-REAL = Path("/work/shared/splats")
+REAL = Path(__file__).parents[3] / "shared" / "splats"
 
 
 def made(count: int = 5, degree: int = 3) -> Splats:
