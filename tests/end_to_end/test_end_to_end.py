@@ -35,13 +35,6 @@ def in_a_new_process(*arguments: object) -> str:
 
 
 @pytest.fixture(scope="module")
-def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data") / "scene"
-    assert main(["demo-scene", str(folder), "--views", "40", "--width", "64", "--height", "48"]) == 0
-    return folder
-
-
-@pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory, scene_folder: Path) -> Path:
     """The folder of a finished run, named `tiny`."""
     folder = tmp_path_factory.mktemp("runs") / "tiny"

@@ -1,7 +1,7 @@
 """What training is, whatever is trained: views in turn, steps to the end, progress, checkpoints, a stop at any time."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -11,8 +11,10 @@ import torch
 from torch import Tensor
 
 from compgs.config import TrainingConfig
-from compgs.errors import TrainingError
+from compgs.errors import ConfigError, TrainingError
+from compgs.losses import Target
 from compgs.scene.views import View
+from compgs.training.checkpoint import CHECKPOINT_NAME
 from compgs.training.interrupt import held_back
 
 REPORT_EVERY = 10  # steps between two status reports
@@ -64,6 +66,27 @@ class Trains(Protocol):
     def finish(self) -> None: ...
 
     def save(self, path: Path) -> None: ...
+
+
+def chosen_device(device: str | torch.device | None) -> torch.device:
+    """The given one, else CUDA where there is one."""
+    return torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+
+
+def checkpoint_path(output: str | Path | None, *, resume: bool) -> Path | None:
+    """In the run's folder, if there is one. Raises ConfigError if there is none to resume from."""
+    if output is None and resume:
+        raise ConfigError("resume needs an output folder: the one of the run to continue")
+    return None if output is None else Path(output) / CHECKPOINT_NAME
+
+
+def kept_target(
+    targets: dict[int, Target], view_index: int, views: Sequence[View], device: torch.device
+) -> Target:
+    """The photograph of a view; each goes to the device once and stays there."""
+    if view_index not in targets:
+        targets[view_index] = Target.from_image(views[view_index].image, device)
+    return targets[view_index]
 
 
 def next_view(order: list[int], views: int, shuffle: np.random.Generator) -> int:

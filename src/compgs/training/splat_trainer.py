@@ -20,7 +20,6 @@ from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
 from compgs.render import RasterSettings, rasterize, visible_mask
 from compgs.scene.views import Scene
 from compgs.training.checkpoint import (
-    CHECKPOINT_NAME,
     check_same_run,
     optimizer_tensors,
     read_checkpoint_file,
@@ -29,7 +28,15 @@ from compgs.training.checkpoint import (
     write_checkpoint_file,
 )
 from compgs.training.densification import DensityControl, densify_schedule
-from compgs.training.loop import StepResult, TrainingStatus, next_view, run_to_end
+from compgs.training.loop import (
+    StepResult,
+    TrainingStatus,
+    checkpoint_path,
+    chosen_device,
+    kept_target,
+    next_view,
+    run_to_end,
+)
 from compgs.training.optimizers import exponential_decay, set_learning_rates
 from compgs.training.profile import NoProfile, StepProfile
 from compgs.training.splat_parameters import (
@@ -63,11 +70,9 @@ def train_splats(
     """
     config = config or load_config(preset)
     check_config(config)
-    chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    path = Path(output) / CHECKPOINT_NAME if output is not None else None
-    if resume:
-        if path is None:
-            raise ConfigError("resume needs an output folder: the one of the run to continue")
+    chosen = chosen_device(device)
+    path = checkpoint_path(output, resume=resume)
+    if resume and path:
         trainer = SplatTrainer.resumed(scene, path, config, chosen)
     else:
         trainer = SplatTrainer(scene, config, chosen)
@@ -165,11 +170,7 @@ class SplatTrainer:
             reset_opacities(self.parameters, self.optimizer, self.config.splats.reset_opacity)
 
     def target(self, view_index: int) -> Target:
-        if view_index not in self.targets:
-            self.targets[view_index] = Target.from_image(
-                self.scene.train_views[view_index].image, self.device
-            )
-        return self.targets[view_index]
+        return kept_target(self.targets, view_index, self.scene.train_views, self.device)
 
     # the run -------------------------------------------------------------------------------------------------------
 

@@ -30,7 +30,6 @@ from compgs.scene.points import median_spacing, voxel_grid
 from compgs.scene.views import Scene, View
 from compgs.trained_model import BIAS_BITS, TrainedModel
 from compgs.training.checkpoint import (
-    CHECKPOINT_NAME,
     Checkpoint,
     check_same_run,
     load_checkpoint,
@@ -39,7 +38,15 @@ from compgs.training.checkpoint import (
     save_checkpoint,
 )
 from compgs.training.control import AdaptiveControl, make_schedule
-from compgs.training.loop import StepResult, TrainingStatus, next_view, run_to_end
+from compgs.training.loop import (
+    StepResult,
+    TrainingStatus,
+    checkpoint_path,
+    chosen_device,
+    kept_target,
+    next_view,
+    run_to_end,
+)
 from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rates, step_rows
 from compgs.training.profile import NoProfile, StepProfile
 from compgs.training.rate_control import RateState, due, follow
@@ -72,11 +79,9 @@ def train(
     """
     config = config or load_config(preset)
     check_config(config)
-    chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    path = Path(output) / CHECKPOINT_NAME if output is not None else None
-    if resume:
-        if path is None:
-            raise ConfigError("resume needs an output folder: the one of the run to continue")
+    chosen = chosen_device(device)
+    path = checkpoint_path(output, resume=resume)
+    if resume and path:
         trainer = Trainer.resumed(scene, load_checkpoint(path), config, chosen)
     else:
         trainer = Trainer(scene, config, chosen)
@@ -204,11 +209,7 @@ class Trainer:
         return StepResult(torch.zeros(()), background.expand(*view.image.shape), view)
 
     def target(self, view_index: int) -> Target:
-        if view_index not in self.targets:
-            self.targets[view_index] = Target.from_image(
-                self.scene.train_views[view_index].image, self.device
-            )
-        return self.targets[view_index]
+        return kept_target(self.targets, view_index, self.scene.train_views, self.device)
 
     @torch.no_grad()
     def visible_anchors(self, camera: Camera) -> Tensor:
