@@ -32,6 +32,9 @@ class ModelConfig:
         None  # world units between neighbouring anchors; None: from the points' spacing
     )
     voxel_spacings: float = 1.5  # median distances of the points to a voxel, where voxel_size is not given
+    point_colors: bool = (
+        True  # anchors start with the colors of the points, in three channels of their references
+    )
     max_anchors: int = 1_000_000  # growth stops here
 
 
@@ -197,6 +200,11 @@ def check_config(config: Config) -> None:
         ("model.heads", m.heads in ("separate", "paired"), "separate or paired"),
         ("model.voxel_size", m.voxel_size is None or 0 < m.voxel_size < float("inf"), "above 0"),
         ("model.voxel_spacings", 0 < m.voxel_spacings < 1e6, "above 0"),
+        (
+            "model.point_colors",
+            isinstance(m.point_colors, bool) and (m.reference_dim >= 3 or not m.point_colors),
+            "true or false; true needs a model.reference_dim of 3 or more",
+        ),
         ("model.max_anchors", 1 <= m.max_anchors <= 1 << 24, "1 to 16777216"),
         ("entropy.reference_hyper_dim", 1 <= e.reference_hyper_dim <= 64, "1 to 64"),
         ("entropy.residual_hyper_dim", 1 <= e.residual_hyper_dim <= 64, "1 to 64"),

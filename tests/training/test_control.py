@@ -1,8 +1,9 @@
 import torch
 
 from compgs.training.control import AdaptiveControl, make_schedule
+from compgs.training.initial import initial_model
 from compgs.training.optimizers import ANCHOR_PARAMETERS, make_optimizer
-from compgs.training.trainer import Trainer, initial_model
+from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
 

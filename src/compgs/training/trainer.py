@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from compgs.cameras import Camera
@@ -26,7 +25,6 @@ from compgs.losses import (
 )
 from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
 from compgs.render import RasterSettings, contributions, rasterize, visible_mask
-from compgs.scene.points import median_spacing, voxel_grid
 from compgs.scene.views import Scene, View
 from compgs.trained_model import BIAS_BITS, TrainedModel
 from compgs.training.checkpoint import (
@@ -38,6 +36,7 @@ from compgs.training.checkpoint import (
     save_checkpoint,
 )
 from compgs.training.control import AdaptiveControl, make_schedule
+from compgs.training.initial import initial_model
 from compgs.training.loop import (
     StepResult,
     TrainingStatus,
@@ -389,24 +388,3 @@ def worth_keeping(contributions: Tensor, idle_share: float) -> Tensor:
     kept = contributions > 0
     kept[ascending.indices[idle]] = False
     return kept
-
-
-def initial_model(scene: Scene, config: Config) -> TrainedModel:
-    """Anchors on the voxel grid of the scene's points, as large as the distance to their neighbours."""
-    m = config.model
-    wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
-    coordinates, voxel_size = voxel_grid(scene.points, wanted)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.training.seed)
-        model = TrainedModel(
-            config, torch.from_numpy(coordinates), voxel_size, scene.extent, scene.background
-        )
-    neighbours = min(4, len(coordinates))
-    distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(len(coordinates), neighbours)
-    spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(1)
-    with torch.no_grad():
-        model.log_scales.copy_(
-            torch.from_numpy(np.log(np.maximum(spread, 0.1))).float()[:, None].expand(-1, 6)
-        )
-        model.entropy.fit_covariance_prior(model.log_scales)
-    return model

@@ -1,0 +1,44 @@
+"""The model that training starts from."""
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from compgs.config import Config
+from compgs.scene.points import colors_at, median_spacing, voxel_grid
+from compgs.scene.views import Scene
+from compgs.trained_model import TrainedModel
+
+
+def initial_model(scene: Scene, config: Config) -> TrainedModel:
+    """Anchors on the voxel grid of the scene's points (CompGS Sec. 3.4), as large as the distance to their neighbours.
+
+    With `point_colors` they have the points' colors, too: from gray, hundreds of steps would go into finding them.
+    """
+    m = config.model
+    wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
+    coordinates, voxel_size = voxel_grid(scene.points, wanted)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.training.seed)
+        model = TrainedModel(
+            config, torch.from_numpy(coordinates), voxel_size, scene.extent, scene.background
+        )
+    neighbours = min(4, len(coordinates))
+    distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(len(coordinates), neighbours)
+    spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(1)
+    with torch.no_grad():
+        model.log_scales.copy_(
+            torch.from_numpy(np.log(np.maximum(spread, 0.1))).float()[:, None].expand(-1, 6)
+        )
+        model.entropy.fit_covariance_prior(model.log_scales)
+        if m.point_colors:
+            logits = torch.from_numpy(logit(colors_at(scene.points, model.positions().numpy()))).float()
+            model.heads.pass_colors(logits.mean(0))
+            model.references[:, :3] = (logits - logits.mean(0)) / config.entropy.reference_step
+    return model
+
+
+def logit(colors: np.ndarray) -> np.ndarray:
+    """Of colors in 0 to 1; black and white have none, and what is nearly so would be far from everything else."""
+    clipped = np.clip(colors, 0.05, 0.95)
+    return np.log(clipped / (1.0 - clipped))
