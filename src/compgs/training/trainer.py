@@ -103,6 +103,7 @@ class Trainer:
         self.model = (model or initial_model(scene, config)).to(device)
         self.optimizer = make_optimizer(self.model, config.training)
         self.schedule = make_schedule(config.control, config.training.steps, len(scene.train_views))
+        self.pruned_at = {round(share * config.training.steps) for share in config.control.prune_at}
         self.control = AdaptiveControl(config, self.schedule, self.model.anchors, device)
         self.chance = torch.Generator(device).manual_seed(config.training.seed + 1)  # of growth
         self.shuffle = np.random.default_rng(config.training.seed + 2)
@@ -184,7 +185,12 @@ class Trainer:
             if gradient is not None:
                 self.control.observe(rows, prediction, gradient, view.camera)
             if self.schedule.due(self.step):
-                self.control.act(self.model, self.optimizer, self.coupled_means(), self.chance)
+                self.control.act(
+                    self.model, self.optimizer, self.coupled_means(), self.chance, self.rate.lmbda
+                )
+            profile.lap("control")
+        if self.step in self.pruned_at:
+            self.prune()
             profile.lap("control")
         profile.end()
         self.step += 1
@@ -331,6 +337,18 @@ class Trainer:
     @torch.no_grad()
     def seen(self) -> Tensor:
         """[N, K] bool: coupled primitives that the training views would miss."""
+        total = self.contributions()
+        return worth_keeping(total.view(-1), self.config.control.idle_share).view_as(total)
+
+    @torch.no_grad()
+    def prune(self) -> None:
+        """Remove the anchors that add least to the training views: what is left of the run makes up for them."""
+        kept = worth_keeping(self.contributions().sum(1), self.config.control.prune_share)
+        if kept.any():
+            self.control.keep(self.model, self.optimizer, kept)
+
+    def contributions(self) -> Tensor:
+        """[N, K] float64: blending weights of the coupled primitives, summed over the pixels of all training views."""
         model, k = self.model, self.config.model.coupled_primitives
         total = torch.zeros(model.anchors * k, dtype=torch.float64, device=self.device)
         for view in self.scene.train_views:
@@ -341,7 +359,7 @@ class Trainer:
             slots = rows[prediction.index // k] * k + prediction.index % k
             # Each slot comes once: no sum depends on an order.
             total[slots] += contributions(prediction.gaussians, view.camera, self.settings).double()
-        return worth_keeping(total, self.config.control.idle_share).view(-1, k)
+        return total.view(-1, k)
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
