@@ -63,7 +63,7 @@ STUDIES: dict[str, tuple[Variant, ...]] = {
     ),
     "residuals": (
         Variant("without", "without residual embeddings", _set("model.residuals=false")),
-        Variant("with", "with residual embeddings"),
+        Variant("with", "with residual embeddings", _set("model.residuals=true")),
     ),
     "coupled": tuple(
         Variant(f"k{k}", f"K = {k}", _set(f"model.coupled_primitives={k}")) for k in (5, 10, 15)

@@ -23,7 +23,9 @@ class ModelConfig:
     coupled_primitives: int = 5  # K, per anchor (10 in Sec. 3.4: slower, and no better at the same size)
     reference_dim: int = 32  # channels of a reference embedding (Sec. 3.4)
     residual_dim: int = 8  # channels of a residual embedding (Sec. 3.4)
-    residuals: bool = True  # False: the K residual embeddings are the same for all anchors (ablation, Tab. 5)
+    residuals: bool = (
+        False  # True: each anchor has its own K residual embeddings (Sec. 3.1); else all share K of them
+    )
     width: int = 32  # hidden width of the residual MLPs (Ref.)
     heads: Literal["separate", "paired"] = (
         "paired"  # separate: four networks (Sec. 3.2); paired: geometry, appearance
@@ -66,9 +68,9 @@ class ControlConfig:
     start: float = 0.15  # of the steps: first control
     stop: float = 0.5  # of the steps: last control
     every: float = 0.05  # of the steps between two controls, at least twice the number of views
-    gradient_threshold: float = 1e-4  # mean norm of the 2D gradient, in units of half the image
+    gradient_threshold: float = 8e-5  # mean norm of the 2D gradient, in units of half the image (Ref.: 1e-4)
     rate_exponent: float = (
-        1 / 3  # that threshold grows with this power of lambda / 0.004: anchors cost bits (0 in Scaffold-GS)
+        1 / 3  # threshold and pruned share grow with this power of lambda / 0.002: anchors cost bits
     )
     minimum_views: int = 20  # a primitive seen less often is not judged
     opacity_threshold: float = (
@@ -89,7 +91,7 @@ class TrainingConfig:
     steps: int = 30_000  # one view each
     seed: int = 0
     lmbda: float = (
-        0.004  # weight of the rate; 0: the entropy networks learn what the latents cost, these do not care
+        0.002  # weight of the rate; 0: the entropy networks learn what the latents cost, these do not care
     )
     target_bytes: int | None = None  # size of the file to aim at: lambda, from its setting on, follows it
     rate: Literal["bits", "elements"] = (
@@ -200,7 +202,7 @@ def check_config(config: Config) -> None:
         ("model.coupled_primitives", 1 <= m.coupled_primitives <= 64, "1 to 64"),
         ("model.reference_dim", 1 <= m.reference_dim <= 256, "1 to 256"),
         ("model.residual_dim", 1 <= m.residual_dim <= 64, "1 to 64"),
-        ("model.residuals", m.residuals or not t.sparse_adam, "true where training.sparse_adam is"),
+        ("model.residuals", isinstance(m.residuals, bool), "true or false"),
         ("model.width", 8 <= m.width <= 256 and m.width % 8 == 0, "a multiple of 8 up to 256"),
         ("model.heads", m.heads in ("separate", "paired"), "separate or paired"),
         ("model.voxel_size", m.voxel_size is None or 0 < m.voxel_size < float("inf"), "above 0"),

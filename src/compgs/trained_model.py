@@ -51,7 +51,8 @@ class TrainedModel(nn.Module):
         self.register_buffer("mask", torch.ones(n, m.coupled_primitives, dtype=torch.bool))
         self.log_scales = nn.Parameter(torch.zeros(n, 6))
         self.references = nn.Parameter(torch.zeros(n, m.reference_dim))
-        self.residuals = nn.Parameter(self.entropy.starting_residuals().repeat(n, 1))
+        # Without residual embeddings of their own, all anchors have the one row that there is.
+        self.residuals = nn.Parameter(self.entropy.starting_residuals().repeat(n if m.residuals else 1, 1))
         if not m.residuals:
             self.entropy.expect_constant_residuals()
 
@@ -68,13 +69,14 @@ class TrainedModel(nn.Module):
         coordinates = self.coordinates if rows is None else self.coordinates[rows]
         return coordinates.to(torch.float32) * self.voxel_size
 
-    def share_residuals(self) -> None:
-        """Without residual embeddings of their own, all anchors have those of the first, which alone learn.
+    @property
+    def anchor_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that have a row for each anchor."""
+        return ("log_scales", "references", *(("residuals",) if self.config.model.residuals else ()))
 
-        The file has them as what it expects: no symbol is other than zero.
-        """
+    def share_residuals(self) -> None:
+        """The file has the residuals that all anchors share as what it expects: no symbol is other than zero."""
         with torch.no_grad():
-            self.residuals[1:] = self.residuals[0]
             self.entropy.residual_network.biases[-1][: self.residuals.shape[1]] = self.residuals[0]
 
     def quantized(
@@ -99,8 +101,7 @@ class TrainedModel(nn.Module):
             chosen(self.references),
             chosen(self.log_scales) / self.entropy.covariance_step,
         )
-        own = self.config.model.residuals
-        residuals = chosen(self.residuals) if own else self.residuals[:1].expand(len(references), -1)
+        residuals = chosen(self.residuals) if self.config.model.residuals else self.residuals
         latents = self.entropy(
             references,
             covariances,
@@ -110,7 +111,9 @@ class TrainedModel(nn.Module):
             network_bits=e.network_bits if stored_weights else None,
             mask=chosen(self.mask) if masked else None,
         )
-        return latents if e.quantized else Quantized(references, covariances, residuals, latents.bits)
+        if e.quantized:
+            return latents
+        return Quantized(references, covariances, residuals.expand(len(references), -1), latents.bits)
 
     def primitives(self, latents: Quantized, rows: Tensor | None = None) -> Primitives:
         """Dequantize: all K coupled primitives of the given anchors, as prediction sees them."""
@@ -120,7 +123,7 @@ class TrainedModel(nn.Module):
             positions=self.positions(rows),
             log_scales=latents.covariances * self.entropy.covariance_step,
             references=latents.references * e.reference_step,
-            residuals=(latents.residuals * e.residual_step).view(n * m.coupled_primitives, m.residual_dim),
+            residuals=(latents.residuals * e.residual_step).reshape(n * m.coupled_primitives, m.residual_dim),
             anchor_index=every_slot(n, m.coupled_primitives, self.device),
             voxel_size=self.voxel_size,
         )

@@ -8,9 +8,11 @@ from compgs.codec import decode, encode
 from compgs.codec.content import cross_entropy_bits
 from compgs.codec.encoder import to_content
 from compgs.codec.reader import file_info, read_content
-from compgs.config import Config, EntropyConfig
+from compgs.config import Config, EntropyConfig, ModelConfig
 from compgs.errors import CorruptSection, NotEncodable, OutputError
 from compgs.trained_model import TrainedModel
+
+OWN_RESIDUALS = Config(model=ModelConfig(residuals=True))
 
 
 def made_model(anchors: int = 400, seed: int = 0, config: Config | None = None) -> TrainedModel:
@@ -18,7 +20,7 @@ def made_model(anchors: int = 400, seed: int = 0, config: Config | None = None) 
     rng = np.random.default_rng(seed)
     coordinates = np.unique(rng.integers(-60, 60, (anchors, 3)), axis=0).astype(np.int32)
     torch.manual_seed(seed)
-    model = TrainedModel(config or Config(), torch.from_numpy(coordinates), 0.02, 5.0, (0.0, 0.0, 0.0))
+    model = TrainedModel(config or OWN_RESIDUALS, torch.from_numpy(coordinates), 0.02, 5.0, (0.0, 0.0, 0.0))
     with torch.no_grad():
         model.references.normal_(0, 1.5)
         model.residuals.add_(torch.randn_like(model.residuals))
@@ -160,3 +162,19 @@ def test_symbols_do_not_depend_on_the_number_of_threads(threads):
     finally:
         numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
         torch.set_num_threads(2)
+
+
+def test_shared_residuals_are_in_the_file_though_no_symbol_is(tmp_path):
+    """All anchors have the one row, rounded as the entropy network's constants are."""
+    model = made_model(500, config=Config())
+    assert len(model.residuals) == 1
+    with torch.no_grad():
+        model.residuals.normal_(0, 2, generator=torch.Generator().manual_seed(1))
+        model.mask[:] = True
+    model.share_residuals()
+    encode(model, tmp_path / "a.cgs")
+    decoded = decode(tmp_path / "a.cgs").primitives.residuals
+    row = (model.residuals * model.config.entropy.residual_step).detach().view(5, 8)
+    torch.testing.assert_close(decoded.view(-1, 5, 8), row.expand(model.anchors, -1, -1), atol=1e-3, rtol=0)
+    sizes = {s.name: s.bytes for s in file_info((tmp_path / "a.cgs").read_bytes()).sections}
+    assert sizes["residual embeddings"] + sizes["residual hyperprior"] < 100

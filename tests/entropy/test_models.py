@@ -6,7 +6,7 @@ import torch
 from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy import STREAMS, EntropyModel
 
-MODEL = ModelConfig(coupled_primitives=3, reference_dim=6, residual_dim=4)
+MODEL = ModelConfig(coupled_primitives=3, reference_dim=6, residuals=True, residual_dim=4)
 ENTROPY = EntropyConfig(reference_hyper_dim=2, residual_hyper_dim=3)
 
 

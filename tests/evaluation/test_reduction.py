@@ -29,7 +29,7 @@ def data() -> bytes:
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
     coordinates = np.unique(rng.integers(-20, 20, (120, 3)), axis=0).astype(np.int32)
-    config = Config(model=ModelConfig(coupled_primitives=4, reference_dim=8, width=16))
+    config = Config(model=ModelConfig(coupled_primitives=4, reference_dim=8, residuals=True, width=16))
     model = TrainedModel(config, torch.from_numpy(coordinates), 0.05, 3.0, (0.0, 0.0, 0.0))
     with torch.no_grad():
         model.references.normal_(0, 4)

@@ -3,9 +3,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from compgs.training.control import AdaptiveControl, growth_threshold, make_schedule
+from compgs.training.control import AdaptiveControl, make_schedule, rate_weight
 from compgs.training.initial import initial_model
-from compgs.training.optimizers import ANCHOR_PARAMETERS, make_optimizer
+from compgs.training.optimizers import make_optimizer
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -50,13 +50,14 @@ def test_transparent_anchors_are_removed_with_their_moments(blob_scene, tiny_con
     control.seen[:] = 100
     control.opacity[:] = torch.where(gone, 0.0, 50.0)
     control.drawn[:] = 0
-    expected = {name: getattr(model, name).detach()[~gone] for name in ANCHOR_PARAMETERS}
+    expected = {name: getattr(model, name).detach()[~gone] for name in model.anchor_parameters}
     moments = {
-        name: trainer.optimizer.state[getattr(model, name)]["exp_avg"][~gone] for name in ANCHOR_PARAMETERS
+        name: trainer.optimizer.state[getattr(model, name)]["exp_avg"][~gone]
+        for name in model.anchor_parameters
     }
     means = trainer.coupled_means()
     control.act(model, trainer.optimizer, means, torch.Generator().manual_seed(0), 0.004)
-    for name in ANCHOR_PARAMETERS:
+    for name in model.anchor_parameters:
         parameter = getattr(model, name)
         assert torch.equal(parameter.detach(), expected[name])
         assert torch.equal(trainer.optimizer.state[parameter]["exp_avg"], moments[name])
@@ -74,14 +75,12 @@ def test_a_scene_whose_anchors_are_all_transparent_keeps_them(blob_scene, tiny_c
     assert trainer.model.anchors == before
 
 
-def test_growth_asks_for_more_where_bits_weigh_more(tiny_config):
-    control = replace(tiny_config.control, gradient_threshold=2e-4, rate_exponent=0.5)
-    assert growth_threshold(control, 0.004) == pytest.approx(2e-4)
-    assert growth_threshold(control, 0.016) == pytest.approx(4e-4)
-    assert (
-        growth_threshold(control, 0.0) == growth_threshold(control, 1e-4) < 1e-4
-    )  # without a rate, too, it ends
-    assert growth_threshold(replace(control, rate_exponent=0.0), 0.016) == 2e-4
+def test_an_anchor_has_to_add_more_where_bits_weigh_more(tiny_config):
+    control = replace(tiny_config.control, rate_exponent=0.5)
+    assert rate_weight(control, 0.002) == pytest.approx(1)
+    assert rate_weight(control, 0.008) == pytest.approx(2)
+    assert rate_weight(control, 0.0) == rate_weight(control, 1e-4) < 0.3  # without a rate, too, growth ends
+    assert rate_weight(replace(control, rate_exponent=0.0), 0.008) == 1
 
 
 def test_the_schedule_scales_with_the_run(tiny_config):

@@ -9,7 +9,6 @@ import torch
 
 from compgs.training.initial import initial_model
 from compgs.training.optimizers import (
-    ANCHOR_PARAMETERS,
     DECAYS,
     adam_rows,
     make_optimizer,
@@ -27,13 +26,13 @@ def run(scene, config, views: list[torch.Tensor], step) -> dict[str, torch.Tenso
     optimizer = make_optimizer(model, config.training)
     noise = torch.Generator().manual_seed(0)
     for rows in views:
-        for name in ANCHOR_PARAMETERS:
+        for name in model.anchor_parameters:
             parameter = getattr(model, name)
             parameter.grad = torch.zeros_like(parameter)
             parameter.grad[rows] = torch.randn(len(rows), parameter.shape[1], generator=noise)
         step(model, optimizer, rows)
     result = {}
-    for name in ANCHOR_PARAMETERS:
+    for name in model.anchor_parameters:
         parameter = getattr(model, name)
         state = optimizer.state[parameter]
         result |= {name: parameter.detach(), f"{name}/1": state["exp_avg"], f"{name}/2": state["exp_avg_sq"]}
@@ -46,12 +45,12 @@ def dense(model, optimizer, rows):
 
 def sparse(model, optimizer, rows):
     step_rows(model, optimizer, rows)
-    assert all(getattr(model, name).grad is None for name in ANCHOR_PARAMETERS)
+    assert all(getattr(model, name).grad is None for name in model.anchor_parameters)
 
 
 def plain(model, optimizer, rows):
     """`adam_rows`, as on a GPU."""
-    for group in optimizer.param_groups[: len(ANCHOR_PARAMETERS)]:
+    for group in optimizer.param_groups[: len(model.anchor_parameters)]:
         (p,) = group["params"]
         state = optimizer.state[p]
         if not state:

@@ -8,7 +8,6 @@ import torch
 from compgs.config import Config
 from compgs.losses import photometric_loss
 from compgs.scene.views import Scene
-from compgs.training.optimizers import ANCHOR_PARAMETERS
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -66,7 +65,7 @@ def test_moments_stay_with_their_anchors_and_training_goes_on(blob_scene: Scene,
     trainer = Trainer(blob_scene, tiny_config, CPU)
     trainer.train_step()
     kept = torch.arange(trainer.model.anchors) % 3 != 0
-    name = ANCHOR_PARAMETERS[0]
+    name = trainer.model.anchor_parameters[0]
     moment = trainer.optimizer.state[getattr(trainer.model, name)]["exp_avg"][kept].clone()
     trainer.control.keep(trainer.model, trainer.optimizer, kept)
     assert torch.equal(trainer.optimizer.state[getattr(trainer.model, name)]["exp_avg"], moment)

@@ -73,7 +73,7 @@ def to_content(model: TrainedModel) -> FileContent:
     mask = model.mask.cpu()[kept].numpy()
 
     def rows(parameter: Tensor) -> Tensor:
-        return parameter.detach().cpu()[kept].double()
+        return parameter.detach().cpu().expand(model.anchors, -1)[kept].double()
 
     networks = {
         "reference": integer_network(entropy.reference_network, e.network_bits),
@@ -89,6 +89,8 @@ def to_content(model: TrainedModel) -> FileContent:
     q_f, f_hat = _code(f, z_f * ONE, networks["reference"])
     q_c, _ = _code(c, f_hat, networks["covariance"])
     z_g = _symbols(entropy.residual_analysis.cpu().double()(g))
+    if not m.residuals:  # there is nothing to say about them
+        z_g = np.zeros_like(z_g)
     q_g, _ = _code(g, np.concatenate([z_g * ONE, f_hat], 1), networks["residual"])
     entropy.float().to(model.device)
 

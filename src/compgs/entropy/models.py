@@ -61,6 +61,7 @@ class EntropyModel(nn.Module):
         super().__init__()
         residuals = model.coupled_primitives * model.residual_dim
         hidden = entropy.network_hidden
+        self.own_residuals = model.residuals
         self.reference_analysis = HyperAnalysis(model.reference_dim, entropy.reference_hyper_dim)
         self.reference_density = FactorizedDensity(entropy.reference_hyper_dim)
         self.reference_network = EntropyNetwork(entropy.reference_hyper_dim, model.reference_dim, hidden)
@@ -119,7 +120,7 @@ class EntropyModel(nn.Module):
         self,
         references: Tensor,  # [N, reference_dim] steps
         covariances: Tensor,  # [N, 6] log scales over the covariance step
-        residuals: Tensor,  # [N, K * residual_dim] steps
+        residuals: Tensor,  # [N, K * residual_dim] steps; [1, K * residual_dim] if all anchors share them
         *,
         rate: bool,
         noise: Callable[[Tensor], Tensor] | None = None,
@@ -135,19 +136,22 @@ class EntropyModel(nn.Module):
         code = partial(code_latents, rate=rate, noise=noise, network_bits=network_bits)
         f_hat, bits_f = code(references, round_straight_through(z_f), self.reference_network)
         c_hat, bits_c = code(covariances, f_hat, self.covariance_network)
-        z_g = self.residual_analysis(residuals)
-        context = torch.cat([round_straight_through(z_g), f_hat], 1)
-        g_hat, bits_g = code(residuals, context, self.residual_network, mask=mask)
-        if not rate:
-            return Quantized(f_hat, c_hat, g_hat, {})
         bits = {
-            "reference_hyper": _hyper_bits(self.reference_density, z_f, noise),
+            "reference_hyper": _hyper_bits(self.reference_density, z_f, noise) if rate else bits_f,
             "reference": bits_f,
             "covariance": bits_c,
-            "residual_hyper": _hyper_bits(self.residual_density, z_g, noise),
-            "residual": bits_g,
         }
-        return Quantized(f_hat, c_hat, g_hat, bits)
+        if self.own_residuals:
+            z_g = self.residual_analysis(residuals)
+            context = torch.cat([round_straight_through(z_g), f_hat], 1)
+            g_hat, bits_g = code(residuals, context, self.residual_network, mask=mask)
+            hyper = _hyper_bits(self.residual_density, z_g, noise) if rate else bits_g
+            bits |= {"residual_hyper": hyper, "residual": bits_g}
+        else:  # one row, whatever the context: the network's weights are zero
+            context = residuals.new_zeros(1, self.residual_network.weights[0].shape[1])
+            shared, _ = code(residuals, context, self.residual_network, rate=False)
+            g_hat = shared.expand(len(f_hat), -1)
+        return Quantized(f_hat, c_hat, g_hat, bits if rate else {})
 
 
 def _hyper_bits(density: FactorizedDensity, z: Tensor, noise: Callable[[Tensor], Tensor] | None) -> Tensor:

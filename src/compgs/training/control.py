@@ -14,12 +14,12 @@ from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
 from compgs.model.prediction import Prediction
 from compgs.trained_model import TrainedModel
-from compgs.training.optimizers import ANCHOR_PARAMETERS, replace_rows
+from compgs.training.optimizers import replace_rows
 
 # (gradient threshold factor, grid size in voxels), coarse first
 GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
-# lambda at which a threshold is meant as it is given, and the range in which it follows lambda
-USUAL_LAMBDA, LAMBDA_RANGE = 0.004, (1e-4, 0.1)
+# lambda at which settings of growth and pruning are meant as they are given, and the range in which they follow it
+USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-4, 0.1)
 COORDINATE_LIMIT = 1 << 20  # voxels: what the octree coder can hold
 
 
@@ -45,14 +45,10 @@ def make_schedule(config: ControlConfig, steps: int, views: int) -> ControlSched
     return ControlSchedule(max(1, round(config.start * steps)), round(config.stop * steps), every)
 
 
-def growth_threshold(config: ControlConfig, lmbda: float) -> float:
-    """Mean gradient norm from which a coupled primitive asks for an anchor, in half images.
-
-    What an anchor may gain is to pay for its bits: where bits weigh little, more of them are worth having.
-    """
+def rate_weight(config: ControlConfig, lmbda: float) -> float:
+    """How much more an anchor has to add to the image than at the usual lambda, since it costs bits."""
     least, most = LAMBDA_RANGE
-    weight = min(max(lmbda, least), most) / USUAL_LAMBDA
-    return config.gradient_threshold * weight**config.rate_exponent
+    return (min(max(lmbda, least), most) / USUAL_LAMBDA) ** config.rate_exponent
 
 
 class AdaptiveControl:
@@ -117,7 +113,8 @@ class AdaptiveControl:
     def keep(self, model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor) -> None:
         """Remove all anchors but those that are `kept`, [N] bool."""
         none = {
-            name: getattr(model, name).detach()[:0] for name in (*ANCHOR_PARAMETERS, "coordinates", "mask")
+            name: getattr(model, name).detach()[:0]
+            for name in (*model.anchor_parameters, "coordinates", "mask")
         }
         self._replace(model, optimizer, kept, none)
 
@@ -139,7 +136,7 @@ class AdaptiveControl:
         target = torch.round(means.view(-1, 3) / model.voxel_size)
         taken = model.coordinates.to(torch.int64)
         room = m.max_anchors - model.anchors
-        threshold = growth_threshold(c, lmbda)
+        threshold = c.gradient_threshold * rate_weight(c, lmbda)
         grown: dict[str, list[Tensor]] = {name: [] for name in ("coordinates", "references", "log_scales")}
         for level, (factor, size) in enumerate(GROWTH_LEVELS):
             asks = flat >= threshold * factor

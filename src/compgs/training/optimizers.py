@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from compgs.config import TrainingConfig
 from compgs.trained_model import TrainedModel
 
-ANCHOR_PARAMETERS = ("log_scales", "references", "residuals")
 HEAD_GROUPS = ("geometry", "appearance", "translation", "covariance", "opacity", "color")
 ROW_CHUNKS = 32
 ADAM_EPSILON = 1e-15  # gradients of single primitives are tiny (3DGS)
@@ -83,7 +82,7 @@ def step_rows(model: TrainedModel, optimizer: torch.optim.Adam, rows: Tensor) ->
     corrections count all steps.
     """
     groups = {group["name"]: group for group in optimizer.param_groups}
-    for name in ANCHOR_PARAMETERS:
+    for name in model.anchor_parameters:
         parameter, group = getattr(model, name), groups[name]
         if parameter.grad is None:
             continue
@@ -151,7 +150,7 @@ def replace_rows(
     """
     model.coordinates = torch.cat([model.coordinates[kept], added["coordinates"]])
     model.mask = torch.cat([model.mask[kept], added["mask"]])
-    for name in ANCHOR_PARAMETERS:
+    for name in model.anchor_parameters:
         old = getattr(model, name)
         new = nn.Parameter(torch.cat([old.detach()[kept], added[name]]))
         setattr(model, name, new)

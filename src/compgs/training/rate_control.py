@@ -30,7 +30,7 @@ class RateState:
 
     lmbda: float
     error: float | None = None  # log(size / target) at the last look after growth; None before the first
-    share: float = 1.0  # of today's bytes that stay when what no view sees is dropped at the end
+    share: float = 1.0  # of today's bytes that stay when what adds least has been removed
 
 
 def due(step: int, steps: int, rate_start: float) -> bool:

@@ -35,7 +35,7 @@ from compgs.training.checkpoint import (
     restore_optimizer,
     save_checkpoint,
 )
-from compgs.training.control import AdaptiveControl, make_schedule
+from compgs.training.control import AdaptiveControl, make_schedule, rate_weight
 from compgs.training.initial import initial_model
 from compgs.training.loop import (
     StepResult,
@@ -48,7 +48,7 @@ from compgs.training.loop import (
 )
 from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rates, step_rows
 from compgs.training.profile import NoProfile, StepProfile
-from compgs.training.rate_control import RateState, due, follow
+from compgs.training.rate_control import LOOKS, RateState, due, follow
 
 # With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
 FEW_DRAWN = 0.1
@@ -241,12 +241,15 @@ class Trainer:
     def channels(self) -> dict[str, int]:
         """Coded symbols of each stream, of an anchor."""
         m, e = self.config.model, self.config.entropy
+        own = {
+            "residual_hyper": e.residual_hyper_dim,
+            "residual": m.coupled_primitives * m.residual_dim,
+        }
         return {
             "reference_hyper": e.reference_hyper_dim,
             "reference": m.reference_dim,
             "covariance": 6,
-            "residual_hyper": e.residual_hyper_dim,
-            "residual": m.coupled_primitives * m.residual_dim,
+            **(own if m.residuals else {}),
         }
 
     @torch.no_grad()
@@ -314,16 +317,21 @@ class Trainer:
         grown = not self.schedule.active(self.step)
         fixed = self.fixed_bytes()
         size = self.estimated_bytes() - fixed
-        if grown and (self.rate.error is None or self.step % max(1, t.steps // SHARES) == 0):
-            self.rate = replace(self.rate, share=self.seen_share())
+        pruned = any(self.step - t.steps // LOOKS <= at < self.step for at in self.pruned_at)
+        if pruned or self.step % max(1, t.steps // SHARES) == 0 or (grown and self.rate.error is None):
+            self.rate = replace(self.rate, share=self.lasting_share())
         target = max(1, t.target_bytes - fixed)
         progress = self.step / t.steps
         self.rate = follow(self.rate, size * self.rate.share, target, progress=progress, grown=grown)
 
-    def seen_share(self) -> float:
-        """Of the bytes that are not fixed: those that stay when what no view sees is dropped at the end."""
+    def lasting_share(self) -> float:
+        """Of the bytes that are not fixed: those that stay when all is removed that will be, by the end of the run."""
         mask, fixed, size = self.model.mask, self.fixed_bytes(), self.estimated_bytes()
-        self.model.mask = self.seen()
+        total = self.contributions()
+        still = sum(at >= self.step for at in self.pruned_at)
+        kept = worth_keeping(total.sum(1), 1.0 - (1.0 - self.pruned_share()) ** still)
+        seen = worth_keeping(total.view(-1), self.config.control.idle_share).view_as(total)
+        self.model.mask = seen & kept[:, None]
         share = (self.estimated_bytes() - fixed) / (size - fixed) if self.model.mask.any() else 1.0
         self.model.mask = mask
         return share
@@ -343,9 +351,14 @@ class Trainer:
     @torch.no_grad()
     def prune(self) -> None:
         """Remove the anchors that add least to the training views: what is left of the run makes up for them."""
-        kept = worth_keeping(self.contributions().sum(1), self.config.control.prune_share)
+        kept = worth_keeping(self.contributions().sum(1), self.pruned_share())
         if kept.any():
             self.control.keep(self.model, self.optimizer, kept)
+
+    def pruned_share(self) -> float:
+        """Of all blending weights: what the anchors that are removed together may make up, once."""
+        control = self.config.control
+        return min(0.5, control.prune_share * rate_weight(control, self.rate.lmbda))
 
     def contributions(self) -> Tensor:
         """[N, K] float64: blending weights of the coupled primitives, summed over the pixels of all training views."""
