@@ -68,7 +68,7 @@ class ControlConfig:
     start: float = 0.15  # of the steps: first control
     stop: float = 0.5  # of the steps: last control
     every: float = 0.05  # of the steps between two controls, at least twice the number of views
-    gradient_threshold: float = 8e-5  # mean norm of the 2D gradient, in units of half the image (Ref.: 1e-4)
+    gradient_threshold: float = 1e-4  # mean norm of the 2D gradient, in units of half the image
     rate_exponent: float = (
         1 / 3  # threshold and pruned share grow with this power of lambda / 0.002: anchors cost bits
     )
@@ -79,7 +79,7 @@ class ControlConfig:
     idle_share: float = (
         0.002  # of all blending weights in training views: what adds no more is left out of the file
     )
-    prune_at: tuple[float, ...] = (0.5, 0.65, 0.8)  # of the steps: the anchors that add least are removed
+    prune_at: tuple[float, ...] = (0.5, 0.6, 0.7)  # of the steps: the anchors that add least are removed
     prune_share: float = 0.02  # of all blending weights in training views, that go each time
     growth_probability: float = 0.5  # a candidate of level l is kept with probability p^(l + 1)
 
