@@ -37,7 +37,7 @@ from ablation_tables import Record, report, rows_of
 from compgs.outputs import write_bytes, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
-LAMBDAS = (1e-4, 1e-3, 5e-3, 1e-2, 1e-1)
+LAMBDAS = (1e-4, 1e-3, 5e-3, 1e-2, 3e-2, 1e-1)
 
 
 @dataclass(frozen=True)
