@@ -195,6 +195,7 @@ def test_values_out_of_range_are_usage_errors_in_the_words_of_the_option(
         (["encode", "file", "--drop", "0.5", "-o", "out.cgs"], "file: header"),
         (["decode", "nowhere.cgs"], "nowhere.cgs"),
         (["decode", "empty"], "folder"),
+        (["decode", "splats.ply"], "rendered and evaluated"),
         (["decode", "file", "-o", "out"], "file: header"),
         (["decode", "GOLDEN", "-o", "full"], "overwrite"),
         (["render", "nowhere.cgs", "-o", "out"], "nowhere.cgs"),
@@ -223,6 +224,7 @@ def test_wrong_input_is_one_clear_line_and_nothing_is_written(
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "run.cgs").write_bytes(b"precious")
     (tmp_path / "file").write_bytes(b"something else")
+    (tmp_path / "splats.ply").write_bytes(b"ply")
     (tmp_path / "GOLDEN").write_bytes(GOLDEN_FILE.read_bytes())
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 

@@ -135,7 +135,7 @@ def _held_out(capture: Capture, test_every: int) -> frozenset[str]:
 
 
 def _enough_points(capture: Capture, views: list[View]) -> tuple[Points, tuple[str, ...]]:
-    found = len(capture.points)
+    found = _different(capture.points.positions)
     if found >= MIN_POINTS:
         return capture.points, ()
     random = fallback_points([view.camera for view in views], FALLBACK_POINTS)
@@ -144,10 +144,16 @@ def _enough_points(capture: Capture, views: list[View]) -> tuple[Points, tuple[s
         np.concatenate([capture.points.colors, random.colors]),
     )
     note = (
-        f"{capture.points_source} has {found} points, too few to start from: {len(random)} random ones were "
+        f"{capture.points_source} has {found} different points, too few to start from: {len(random)} random ones were "
         f"added where the cameras look"
     )
     return both, (note,)
+
+
+def _different(positions: np.ndarray) -> int:  # positions: [P, 3]
+    """Number of different positions, of at least `MIN_POINTS` perhaps not all."""
+    few = len(np.unique(positions[: 10 * MIN_POINTS], axis=0))
+    return few if few >= MIN_POINTS else len(np.unique(positions, axis=0))
 
 
 def _extent(views: list[View], points: Points) -> float:

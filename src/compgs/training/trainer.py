@@ -23,6 +23,7 @@ from compgs.losses import (
     rate_distortion_loss,
     revival_loss,
     scale_regularizer,
+    scale_unit,
 )
 from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
 from compgs.render import RasterSettings, contributions, rasterize, visible_mask
@@ -43,6 +44,7 @@ from compgs.training.loop import (
     TrainingStatus,
     checkpoint_path,
     chosen_device,
+    diverged,
     kept_target,
     next_view,
     run_to_end,
@@ -55,6 +57,7 @@ from compgs.training.rate_control import RateState, due, follow
 FEW_DRAWN = 0.1
 POSITION_BITS = 10.0  # bits per anchor position, for the estimate only
 OTHER_BYTES = 750  # names of tensors, scene, tables, metadata, container, for the estimate only
+COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
 SHARES = 10  # looks in a run at how much the last step drops, where the size is controlled
 
 
@@ -151,7 +154,8 @@ class Trainer:
         if self.schedule.active(self.step):
             rendered.means2d.retain_grad()
         distortion = photometric_loss(rendered.image, self.target(view_index), t.ssim_weight)
-        loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales, prediction.drawn)
+        unit = scale_unit(gaussians.means, camera_center(view.camera, self.device), self.scene.extent)
+        loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales / unit, prediction.drawn)
         loss = loss + self.revival(prediction)
         profile.lap("loss")
         if latents.bits:
@@ -262,7 +266,8 @@ class Trainer:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         if not any(len(self.visible_anchors(view.camera)) for view in self.scene.train_views):
             raise TrainingError(
-                f"{self.scene.name}: no view sees any of the scene's points; are the poses right?"
+                f"{self.scene.name}: no view sees any of the scene's points from farther than "
+                f"{self.settings.near_plane} world units; are the poses right, and the unit of length?"
             )
         run_to_end(self, self.config.training, path, on_progress)
 
@@ -279,10 +284,12 @@ class Trainer:
         return self.rate.lmbda
 
     def estimated_bytes(self) -> int:
-        """Of the file, were it written now."""
+        """Of the file, were it written now. Raises TrainingError if the latents are not finite any more."""
         model = self.model
         anchors = int(model.mask.any(1).sum())
         bits = sum(model.estimated_bits().values()) + POSITION_BITS * anchors
+        if not math.isfinite(bits):
+            raise diverged(self.step, "rate", bits)
         return int(bits / 8) + self.fixed_bytes()
 
     @torch.no_grad()
@@ -392,10 +399,20 @@ def worth_keeping(contributions: Tensor, idle_share: float) -> Tensor:
 
 
 def initial_model(scene: Scene, config: Config) -> TrainedModel:
-    """Anchors on the voxel grid of the scene's points, as large as the distance to their neighbours."""
+    """Anchors on the voxel grid of the scene's points, as large as the distance to their neighbours.
+
+    Raises ConfigError if the voxel size that was asked for gives too many.
+    """
     m = config.model
     wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
     coordinates, voxel_size = voxel_grid(scene.points, wanted)
+    if m.voxel_size and len(coordinates) > m.max_anchors:
+        raise ConfigError(
+            f"model.voxel_size = {m.voxel_size}: the scene's points fill {len(coordinates)} voxels, "
+            f"model.max_anchors is {m.max_anchors}; use a larger voxel, or allow more anchors"
+        )
+    while len(coordinates) > m.max_anchors:  # ends: at last all points are in one voxel
+        coordinates, voxel_size = voxel_grid(scene.points, COARSER * voxel_size)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.training.seed)
         model = TrainedModel(
