@@ -144,8 +144,8 @@ def _enough_points(capture: Capture, views: list[View]) -> tuple[Points, tuple[s
         np.concatenate([capture.points.colors, random.colors]),
     )
     note = (
-        f"{capture.points_source} has {found} different points, too few to start from: {len(random)} random ones were "
-        f"added where the cameras look"
+        f"{capture.points_source} has {found} points in different places, too few to start from: "
+        f"{len(random)} random ones were added where the cameras look"
     )
     return both, (note,)
 
