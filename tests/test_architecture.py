@@ -13,7 +13,7 @@ import compgs
 SOURCE = Path(compgs.__file__).parent
 
 # A part may import itself, and the parts named here.
-BASE = {"compgs", "errors", "gaussians", "cameras", "config", "outputs", "presets"}
+BASE = {"compgs", "vector_sums", "errors", "gaussians", "cameras", "config", "outputs", "presets"}
 ALLOWED = {
     "compgs": {
         "errors",
@@ -32,6 +32,7 @@ ALLOWED = {
     "cameras": set(),
     "config": {"errors", "presets"},
     "presets": set(),
+    "vector_sums": set(),
     "scene": BASE,
     "render": BASE,
     "model": BASE,

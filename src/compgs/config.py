@@ -32,6 +32,9 @@ class ModelConfig:
         None  # world units between neighbouring anchors; None: from the points' spacing
     )
     voxel_spacings: float = 1.5  # median distances of the points to a voxel, where voxel_size is not given
+    point_colors: bool = (
+        True  # anchors start with the colors of the points, in three channels of their references
+    )
     max_anchors: int = 1_000_000  # growth stops here
 
 
@@ -64,6 +67,9 @@ class ControlConfig:
     stop: float = 0.5  # of the steps: last control
     every: float = 0.05  # of the steps between two controls, at least twice the number of views
     gradient_threshold: float = 1e-4  # mean norm of the 2D gradient, in units of half the image
+    rate_exponent: float = (
+        1 / 3  # that threshold grows with this power of lambda / 0.004: anchors cost bits (0 in Scaffold-GS)
+    )
     minimum_views: int = 20  # a primitive seen less often is not judged
     opacity_threshold: float = (
         5e-4  # anchors with less opacity, summed over K, averaged over views, are removed
@@ -71,6 +77,8 @@ class ControlConfig:
     idle_share: float = (
         0.002  # of all blending weights in training views: what adds no more is left out of the file
     )
+    prune_at: tuple[float, ...] = (0.5, 0.65, 0.8)  # of the steps: the anchors that add least are removed
+    prune_share: float = 0.02  # of all blending weights in training views, that go each time
     growth_probability: float = 0.5  # a candidate of level l is kept with probability p^(l + 1)
 
 
@@ -197,6 +205,11 @@ def check_config(config: Config) -> None:
         ("model.heads", m.heads in ("separate", "paired"), "separate or paired"),
         ("model.voxel_size", m.voxel_size is None or 0 < m.voxel_size < float("inf"), "above 0"),
         ("model.voxel_spacings", 0 < m.voxel_spacings < 1e6, "above 0"),
+        (
+            "model.point_colors",
+            isinstance(m.point_colors, bool) and (m.reference_dim >= 3 or not m.point_colors),
+            "true or false; true needs a model.reference_dim of 3 or more",
+        ),
         ("model.max_anchors", 1 <= m.max_anchors <= 1 << 24, "1 to 16777216"),
         ("entropy.reference_hyper_dim", 1 <= e.reference_hyper_dim <= 64, "1 to 64"),
         ("entropy.residual_hyper_dim", 1 <= e.residual_hyper_dim <= 64, "1 to 64"),
@@ -225,9 +238,12 @@ def check_config(config: Config) -> None:
         ("control.stop", 0 <= c.stop <= 1, "0 to 1"),
         ("control.every", 0 < c.every <= 1, "above 0, up to 1"),
         ("control.gradient_threshold", 0 < c.gradient_threshold < 1e6, "above 0"),
+        ("control.rate_exponent", 0 <= c.rate_exponent <= 2, "0 to 2"),
         ("control.minimum_views", 0 <= c.minimum_views < 1 << 31, "0 or more"),
         ("control.opacity_threshold", 0 <= c.opacity_threshold < 1e3, "0 or more"),
         ("control.idle_share", 0 <= c.idle_share < 1, "0 or more, below 1"),
+        ("control.prune_at", all(0 <= at <= 1 for at in c.prune_at), "numbers from 0 to 1"),
+        ("control.prune_share", 0 <= c.prune_share < 1, "0 or more, below 1"),
         ("control.growth_probability", 0 <= c.growth_probability <= 1, "0 to 1"),
         ("splats.harmonics", 0 <= s.harmonics <= 3, "0 to 3"),
         ("splats.harmonics_every", 0 <= s.harmonics_every <= 1, "0 to 1"),

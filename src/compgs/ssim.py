@@ -15,6 +15,8 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from compgs.vector_sums import add_in_any_order
+
 WINDOW_SIZE = 11
 WINDOW_SIGMA = 1.5
 C1 = 0.01**2
@@ -57,7 +59,7 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
 
 _f = np.float32
 _u = np.uint64
-_FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+_FASTMATH = {"contract", "nsz", "arcp"}
 _TILE = 480  # floats in a row of a tile
 _HALO = 3 * (WINDOW_SIZE // 2)  # floats on each side
 _STRIDE = _TILE + 2 * _HALO + 2
@@ -107,7 +109,7 @@ def _similarity(S, n):
         b1, b2 = m * m + k * k + _C1, xx - m * m + yy - k * k + _C2
         inverse = _ONE / (b1 * b2)
         value = a1 * a2 * inverse
-        total += value
+        total = add_in_any_order(total, value)
         d_xx = -value * b1 * inverse
         d_xy = _TWO * a1 * inverse
         S[i + _S5] = _TWO * inverse * (k * (a2 - a1) + m * value * (b1 - b2))
@@ -142,7 +144,7 @@ def _combine(S, x, y, scale, ssim_factor, l1_factor, d_x):
 def _absolute_difference(x, y, scale):
     total = _ZERO
     for i in range(_u(x.size)):
-        total += abs(x[i] - _f(y[i]) * scale)
+        total = add_in_any_order(total, abs(x[i] - _f(y[i]) * scale))
     return total
 
 

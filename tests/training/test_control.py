@@ -1,8 +1,12 @@
+from dataclasses import replace
+
+import pytest
 import torch
 
-from compgs.training.control import AdaptiveControl, make_schedule
+from compgs.training.control import AdaptiveControl, growth_threshold, make_schedule
+from compgs.training.initial import initial_model
 from compgs.training.optimizers import ANCHOR_PARAMETERS, make_optimizer
-from compgs.training.trainer import Trainer, initial_model
+from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
 
@@ -21,21 +25,19 @@ def test_growth_never_duplicates_a_position_and_keeps_to_the_limit(blob_scene, t
     before = model.anchors
     control.drawn[:] = 1000
     control.gradient[:] = 1e6
-    control.act(model, trainer.optimizer, trainer.coupled_means() * 1.7 + 0.13, generator)
+    control.act(model, trainer.optimizer, trainer.coupled_means() * 1.7 + 0.13, generator, 0.004)
     assert model.anchors > before
     assert len(torch.unique(model.coordinates, dim=0)) == model.anchors
 
 
 def test_the_number_of_anchors_has_a_limit_that_holds(blob_scene, tiny_config):
-    from dataclasses import replace
-
     trainer = ready(blob_scene, tiny_config)
     limit = trainer.model.anchors + 7
     trainer.control.config = replace(tiny_config, model=replace(tiny_config.model, max_anchors=limit))
     trainer.control.drawn[:] = 1000
     trainer.control.gradient[:] = 1e6
     trainer.control.act(
-        trainer.model, trainer.optimizer, trainer.coupled_means() * 2, torch.Generator().manual_seed(0)
+        trainer.model, trainer.optimizer, trainer.coupled_means() * 2, torch.Generator().manual_seed(0), 0.004
     )
     assert trainer.model.anchors == limit
 
@@ -53,7 +55,7 @@ def test_transparent_anchors_are_removed_with_their_moments(blob_scene, tiny_con
         name: trainer.optimizer.state[getattr(model, name)]["exp_avg"][~gone] for name in ANCHOR_PARAMETERS
     }
     means = trainer.coupled_means()
-    control.act(model, trainer.optimizer, means, torch.Generator().manual_seed(0))
+    control.act(model, trainer.optimizer, means, torch.Generator().manual_seed(0), 0.004)
     for name in ANCHOR_PARAMETERS:
         parameter = getattr(model, name)
         assert torch.equal(parameter.detach(), expected[name])
@@ -68,8 +70,18 @@ def test_a_scene_whose_anchors_are_all_transparent_keeps_them(blob_scene, tiny_c
     trainer.control.seen[:] = 100
     trainer.control.opacity[:] = 0
     trainer.control.drawn[:] = 0
-    trainer.control.act(trainer.model, trainer.optimizer, trainer.coupled_means(), torch.Generator())
+    trainer.control.act(trainer.model, trainer.optimizer, trainer.coupled_means(), torch.Generator(), 0.004)
     assert trainer.model.anchors == before
+
+
+def test_growth_asks_for_more_where_bits_weigh_more(tiny_config):
+    control = replace(tiny_config.control, gradient_threshold=2e-4, rate_exponent=0.5)
+    assert growth_threshold(control, 0.004) == pytest.approx(2e-4)
+    assert growth_threshold(control, 0.016) == pytest.approx(4e-4)
+    assert (
+        growth_threshold(control, 0.0) == growth_threshold(control, 1e-4) < 1e-4
+    )  # without a rate, too, it ends
+    assert growth_threshold(replace(control, rate_exponent=0.0), 0.016) == 2e-4
 
 
 def test_the_schedule_scales_with_the_run(tiny_config):

@@ -24,7 +24,8 @@ from compgs.scene.points import fallback_points
 from compgs.scene.views import Points, Scene, View, scene_extent
 from compgs.trained_model import TrainedModel
 from compgs.training import TrainingStatus
-from compgs.training.trainer import Trainer, initial_model
+from compgs.training.initial import initial_model
+from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)

@@ -7,6 +7,7 @@ import numba
 import pytest
 import torch
 
+from compgs.training.initial import initial_model
 from compgs.training.optimizers import (
     ANCHOR_PARAMETERS,
     DECAYS,
@@ -15,7 +16,7 @@ from compgs.training.optimizers import (
     set_learning_rates,
     step_rows,
 )
-from compgs.training.trainer import Trainer, initial_model
+from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
 

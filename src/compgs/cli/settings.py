@@ -47,7 +47,9 @@ def parse_value(kind: Any, text: str) -> Any:
             return None
         return parse_value(next(option for option in options if option is not types.NoneType), text)
     if origin is tuple:
-        parts = text.strip("()[] ").split(",")
+        parts = [part for part in text.strip("()[] ").split(",") if part.strip()]
+        if options[-1] is Ellipsis:  # as many as there are
+            options = (options[0],) * len(parts)
         if len(parts) != len(options):
             raise ValueError(f"expected {len(options)} numbers with a comma between them, found {text!r}")
         return tuple(parse_value(option, part.strip()) for option, part in zip(options, parts, strict=True))

@@ -93,7 +93,7 @@ def _torch_bits(x: Tensor, s: Tensor) -> Tensor:
 
 _f = np.float32
 _i = np.int32
-FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+FASTMATH = {"contract", "nsz", "arcp"}
 BLOCK = 2048  # elements in a pass: scratch memory stays in the first-level cache
 
 # Constants of the kernels in single precision: one double among them would widen every vector.

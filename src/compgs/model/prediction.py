@@ -47,6 +47,14 @@ class PredictionHeads(nn.Module):
             opacity = self.appearance if layout == "paired" else self.opacity
             opacity.output_bias[0] = OPACITY_BIAS
 
+    @torch.no_grad()
+    def pass_colors(self, mean: Tensor) -> None:
+        """The first three reference channels, plus `mean` [3], are the colors' logits, before anything is learned."""
+        network, first = (self.appearance, 1) if self.layout == "paired" else (self.color, 0)
+        network.skip_weight[:3] = 0
+        network.skip_weight[:3, first : first + 3] = torch.eye(3)
+        network.output_bias[first : first + 3] = mean
+
     def forward(self, kind: str, *args: Tensor) -> Tensor:
         """One of `predict_opacity`, `predict_color`, ... by name, so that torch.func.functional_call reaches them."""
         return getattr(self, f"predict_{kind}")(*args)

@@ -32,7 +32,7 @@ _ZERO, _HALF, _ONE, _TWO, _THREE, _FOUR, _SIX, _EIGHT = (_f32(x) for x in (0, 0.
 _K0, _K1, _K2_XY, _K2_Z, _K2_XX = (_f32(x) for x in (Y0, _Y1, _Y2_XY, _Y2_Z, _Y2_XX))
 _K3_3, _K3_XYZ, _K3_1, _K3_Z, _K3_ZXX = (_f32(x) for x in (_Y3_3, _Y3_XYZ, _Y3_1, _Y3_Z, _Y3_ZXX))
 
-_FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+_FASTMATH = {"contract", "nsz", "arcp"}
 _BLOCK = 512  # splats
 
 

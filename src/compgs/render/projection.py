@@ -21,7 +21,7 @@ from compgs.cameras import Camera
 from compgs.render.settings import RasterSettings, jacobian_limits
 
 # No "nnan", "ninf": comparisons with NaN decide what is drawn.
-FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+FASTMATH = {"contract", "nsz", "arcp"}
 f32 = np.float32
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
 # A splat beyond these is not drawn: the squares of its numbers may overflow.

@@ -30,8 +30,9 @@ from compgs.render.binning import (
     tile_at,
     turns,
 )
+from compgs.vector_sums import add_in_any_order
 
-FASTMATH = {"contract", "reassoc", "nsz", "arcp", "nnan", "ninf"}
+FASTMATH = {"contract", "nsz", "arcp", "nnan", "ninf"}
 f32 = np.float32
 ZERO, HALF, ONE = f32(0), f32(0.5), f32(1)
 MOMENTS = 9  # gradient sums of a splat in a tile: alpha, d (2), d d^T (3), color (3)
@@ -104,10 +105,12 @@ def blend_forward(packed, starts, entries, order, background, cutoff, cap, stop,
                     s[pixel + GREEN] += weight * green
                     s[pixel + BLUE] += weight * blue
             k = check
-            unfinished = ZERO  # a sum, which is vectorized; a maximum is not, and took a third of all time
+            unfinished = np.int32(
+                0
+            )  # a sum, which is vectorized; a maximum is not, and took a third of all time
             for i in range(PIXELS):
-                unfinished += ONE if s[i] > ZERO else ZERO
-            if unfinished == ZERO:
+                unfinished += np.int32(1) if s[i] > ZERO else np.int32(0)
+            if unfinished == 0:
                 break
         ends[tile] = k
         for row in range(min(TILE_HEIGHT, height - top)):
@@ -209,15 +212,15 @@ def blend_backward(
                     v = v if open_ else ZERO
                     v = v if uncapped <= cap else ZERO
                     v_dx, v_dy = v * dx, v * dy
-                    m0 += v
-                    mx += v_dx
-                    my += v_dy
-                    mxx += v_dx * dx
-                    mxy += v_dx * dy
-                    myy += v_dy * dy
-                    m_red += weight * g0
-                    m_green += weight * g1
-                    m_blue += weight * g2
+                    m0 = add_in_any_order(m0, v)
+                    mx = add_in_any_order(mx, v_dx)
+                    my = add_in_any_order(my, v_dy)
+                    mxx = add_in_any_order(mxx, v_dx * dx)
+                    mxy = add_in_any_order(mxy, v_dx * dy)
+                    myy = add_in_any_order(myy, v_dy * dy)
+                    m_red = add_in_any_order(m_red, weight * g0)
+                    m_green = add_in_any_order(m_green, weight * g1)
+                    m_blue = add_in_any_order(m_blue, weight * g2)
                 to = order[e]  # sum_moments looks for it where the entry is
                 moments[to, 0] = m0
                 moments[to, 1] = mx

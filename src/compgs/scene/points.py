@@ -11,6 +11,7 @@ from compgs.scene.views import Points
 
 MIN_POINTS = 100  # with fewer, structure from motion says too little of the scene to start from
 MAX_STRAYS = 0.01  # share of the points that may be too far away for the grid
+COLOR_NEIGHBOURS = 4  # points that an anchor's first color is made of: it may lie between two surfaces
 COORDINATE_BITS = 21  # signed range of a coordinate: what the position coder represents
 
 
@@ -36,6 +37,17 @@ def voxel_grid(points: Points, voxel_size: float | None = None) -> tuple[np.ndar
             f"{reach / limit:.3g}, or move the scene to the origin"
         )
     return np.unique(scaled[inside].astype(np.int32), axis=0), size
+
+
+def colors_at(points: Points, positions: np.ndarray) -> np.ndarray:
+    """[N, 3] display RGB in 0 to 1: at positions [N, 3], the mean of the nearest points' colors by inverse distance."""
+    neighbours = min(COLOR_NEIGHBOURS, len(points))
+    distances, nearest = cKDTree(points.positions).query(positions, k=neighbours)
+    distances, nearest = (a.reshape(len(positions), neighbours) for a in (distances, nearest))
+    # A point that is met exactly counts much, not infinitely.
+    weights = 1.0 / (distances + 1e-3 * (distances.mean() + np.finfo(np.float64).tiny))
+    weights /= weights.sum(1, keepdims=True)
+    return (points.colors[nearest] / 255.0 * weights[..., None]).sum(1)
 
 
 def median_spacing(positions: np.ndarray) -> float:  # positions: [P, 3] world units

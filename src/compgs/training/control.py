@@ -14,10 +14,12 @@ from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
 from compgs.model.prediction import Prediction
 from compgs.trained_model import TrainedModel
-from compgs.training.optimizers import replace_rows
+from compgs.training.optimizers import ANCHOR_PARAMETERS, replace_rows
 
 # (gradient threshold factor, grid size in voxels), coarse first
 GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
+# lambda at which a threshold is meant as it is given, and the range in which it follows lambda
+USUAL_LAMBDA, LAMBDA_RANGE = 0.004, (1e-4, 0.1)
 COORDINATE_LIMIT = 1 << 20  # voxels: what the octree coder can hold
 
 
@@ -41,6 +43,16 @@ def make_schedule(config: ControlConfig, steps: int, views: int) -> ControlSched
     """Fractions of the run in steps; every view is seen about once between two controls."""
     every = max(1, round(config.every * steps), views)
     return ControlSchedule(max(1, round(config.start * steps)), round(config.stop * steps), every)
+
+
+def growth_threshold(config: ControlConfig, lmbda: float) -> float:
+    """Mean gradient norm from which a coupled primitive asks for an anchor, in half images.
+
+    What an anchor may gain is to pay for its bits: where bits weigh little, more of them are worth having.
+    """
+    least, most = LAMBDA_RANGE
+    weight = min(max(lmbda, least), most) / USUAL_LAMBDA
+    return config.gradient_threshold * weight**config.rate_exponent
 
 
 class AdaptiveControl:
@@ -73,13 +85,18 @@ class AdaptiveControl:
 
     @torch.no_grad()
     def act(
-        self, model: TrainedModel, optimizer: torch.optim.Adam, means: Tensor, noise: torch.Generator
+        self,
+        model: TrainedModel,
+        optimizer: torch.optim.Adam,
+        means: Tensor,
+        noise: torch.Generator,
+        lmbda: float,
     ) -> None:
-        """Grow and prune. means: [N, K, 3] of all coupled primitives, world units."""
+        """Grow and prune. means: [N, K, 3] of all coupled primitives, world units; lmbda: the rate's present weight."""
         c, n = self.config.control, model.anchors
         judged = self.drawn >= min(c.minimum_views, 2 * self.schedule.every)
         mean_gradient = self.gradient / self.drawn.clamp_min(1)
-        added = self._grow(model, means, torch.where(judged, mean_gradient, 0.0), noise)
+        added = self._grow(model, means, torch.where(judged, mean_gradient, 0.0), noise, lmbda)
         self.gradient[judged] = 0
         self.drawn[judged] = 0
 
@@ -93,14 +110,28 @@ class AdaptiveControl:
 
         new = len(added["coordinates"])
         if new or not kept.all():
-            replace_rows(model, optimizer, kept, added)
-            for name in self.STATISTICS:
-                old = getattr(self, name)
-                setattr(self, name, torch.cat([old[kept], old.new_zeros(new, *old.shape[1:])]))
+            self._replace(model, optimizer, kept, added)
         assert model.anchors == int(kept.sum()) + new and len(kept) == n
 
+    @torch.no_grad()
+    def keep(self, model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor) -> None:
+        """Remove all anchors but those that are `kept`, [N] bool."""
+        none = {
+            name: getattr(model, name).detach()[:0] for name in (*ANCHOR_PARAMETERS, "coordinates", "mask")
+        }
+        self._replace(model, optimizer, kept, none)
+
+    def _replace(
+        self, model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]
+    ) -> None:
+        replace_rows(model, optimizer, kept, added)
+        new = len(added["coordinates"])
+        for name in self.STATISTICS:
+            old = getattr(self, name)
+            setattr(self, name, torch.cat([old[kept], old.new_zeros(new, *old.shape[1:])]))
+
     def _grow(
-        self, model: TrainedModel, means: Tensor, gradient: Tensor, noise: torch.Generator
+        self, model: TrainedModel, means: Tensor, gradient: Tensor, noise: torch.Generator, lmbda: float
     ) -> dict[str, Tensor]:
         """New anchors by name of their parameter. gradient: [N, K], 0 where not judged."""
         c, m = self.config.control, self.config.model
@@ -108,9 +139,10 @@ class AdaptiveControl:
         target = torch.round(means.view(-1, 3) / model.voxel_size)
         taken = model.coordinates.to(torch.int64)
         room = m.max_anchors - model.anchors
+        threshold = growth_threshold(c, lmbda)
         grown: dict[str, list[Tensor]] = {name: [] for name in ("coordinates", "references", "log_scales")}
         for level, (factor, size) in enumerate(GROWTH_LEVELS):
-            asks = flat >= c.gradient_threshold * factor
+            asks = flat >= threshold * factor
             asks &= torch.rand(len(flat), generator=noise, device=flat.device) < c.growth_probability ** (
                 level + 1
             )

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from compgs.cameras import Camera
@@ -27,7 +26,6 @@ from compgs.losses import (
 )
 from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
 from compgs.render import RasterSettings, contributions, rasterize, visible_mask
-from compgs.scene.points import median_spacing, voxel_grid
 from compgs.scene.views import Scene, View
 from compgs.trained_model import BIAS_BITS, TrainedModel
 from compgs.training.checkpoint import (
@@ -39,6 +37,7 @@ from compgs.training.checkpoint import (
     save_checkpoint,
 )
 from compgs.training.control import AdaptiveControl, make_schedule
+from compgs.training.initial import initial_model
 from compgs.training.loop import (
     StepResult,
     TrainingStatus,
@@ -57,7 +56,6 @@ from compgs.training.rate_control import RateState, due, follow
 FEW_DRAWN = 0.1
 POSITION_BITS = 10.0  # bits per anchor position, for the estimate only
 OTHER_BYTES = 750  # names of tensors, scene, tables, metadata, container, for the estimate only
-COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
 SHARES = 10  # looks in a run at how much the last step drops, where the size is controlled
 
 
@@ -107,6 +105,7 @@ class Trainer:
         self.model = (model or initial_model(scene, config)).to(device)
         self.optimizer = make_optimizer(self.model, config.training)
         self.schedule = make_schedule(config.control, config.training.steps, len(scene.train_views))
+        self.pruned_at = {round(share * config.training.steps) for share in config.control.prune_at}
         self.control = AdaptiveControl(config, self.schedule, self.model.anchors, device)
         self.chance = torch.Generator(device).manual_seed(config.training.seed + 1)  # of growth
         self.shuffle = np.random.default_rng(config.training.seed + 2)
@@ -189,7 +188,12 @@ class Trainer:
             if gradient is not None:
                 self.control.observe(rows, prediction, gradient, view.camera)
             if self.schedule.due(self.step):
-                self.control.act(self.model, self.optimizer, self.coupled_means(), self.chance)
+                self.control.act(
+                    self.model, self.optimizer, self.coupled_means(), self.chance, self.rate.lmbda
+                )
+            profile.lap("control")
+        if self.step in self.pruned_at:
+            self.prune()
             profile.lap("control")
         profile.end()
         self.step += 1
@@ -339,6 +343,18 @@ class Trainer:
     @torch.no_grad()
     def seen(self) -> Tensor:
         """[N, K] bool: coupled primitives that the training views would miss."""
+        total = self.contributions()
+        return worth_keeping(total.view(-1), self.config.control.idle_share).view_as(total)
+
+    @torch.no_grad()
+    def prune(self) -> None:
+        """Remove the anchors that add least to the training views: what is left of the run makes up for them."""
+        kept = worth_keeping(self.contributions().sum(1), self.config.control.prune_share)
+        if kept.any():
+            self.control.keep(self.model, self.optimizer, kept)
+
+    def contributions(self) -> Tensor:
+        """[N, K] float64: blending weights of the coupled primitives, summed over the pixels of all training views."""
         model, k = self.model, self.config.model.coupled_primitives
         total = torch.zeros(model.anchors * k, dtype=torch.float64, device=self.device)
         for view in self.scene.train_views:
@@ -349,7 +365,7 @@ class Trainer:
             slots = rows[prediction.index // k] * k + prediction.index % k
             # Each slot comes once: no sum depends on an order.
             total[slots] += contributions(prediction.gaussians, view.camera, self.settings).double()
-        return worth_keeping(total, self.config.control.idle_share).view(-1, k)
+        return total.view(-1, k)
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
@@ -396,34 +412,3 @@ def worth_keeping(contributions: Tensor, idle_share: float) -> Tensor:
     kept = contributions > 0
     kept[ascending.indices[idle]] = False
     return kept
-
-
-def initial_model(scene: Scene, config: Config) -> TrainedModel:
-    """Anchors on the voxel grid of the scene's points, as large as the distance to their neighbours.
-
-    Raises ConfigError if the voxel size that was asked for gives too many.
-    """
-    m = config.model
-    wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
-    coordinates, voxel_size = voxel_grid(scene.points, wanted)
-    if m.voxel_size and len(coordinates) > m.max_anchors:
-        raise ConfigError(
-            f"model.voxel_size = {m.voxel_size}: the scene's points fill {len(coordinates)} voxels, "
-            f"model.max_anchors is {m.max_anchors}; use a larger voxel, or allow more anchors"
-        )
-    while len(coordinates) > m.max_anchors:  # ends: at last all points are in one voxel
-        coordinates, voxel_size = voxel_grid(scene.points, COARSER * voxel_size)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.training.seed)
-        model = TrainedModel(
-            config, torch.from_numpy(coordinates), voxel_size, scene.extent, scene.background
-        )
-    neighbours = min(4, len(coordinates))
-    distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(len(coordinates), neighbours)
-    spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(1)
-    with torch.no_grad():
-        model.log_scales.copy_(
-            torch.from_numpy(np.log(np.maximum(spread, 0.1))).float()[:, None].expand(-1, 6)
-        )
-        model.entropy.fit_covariance_prior(model.log_scales)
-    return model

@@ -1,0 +1,55 @@
+"""The model that training starts from."""
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from compgs.config import Config
+from compgs.errors import ConfigError
+from compgs.scene.points import colors_at, median_spacing, voxel_grid
+from compgs.scene.views import Scene
+from compgs.trained_model import TrainedModel
+
+COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
+
+
+def initial_model(scene: Scene, config: Config) -> TrainedModel:
+    """Anchors on the voxel grid of the scene's points (CompGS Sec. 3.4), as large as the distance to their neighbours.
+
+    With `point_colors` they have the points' colors, too: from gray, hundreds of steps would go into finding them.
+    Raises ConfigError if the voxel size that was asked for gives more than `max_anchors`.
+    """
+    m = config.model
+    wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
+    coordinates, voxel_size = voxel_grid(scene.points, wanted)
+    if m.voxel_size and len(coordinates) > m.max_anchors:
+        raise ConfigError(
+            f"model.voxel_size = {m.voxel_size}: the scene's points fill {len(coordinates)} voxels, "
+            f"model.max_anchors is {m.max_anchors}; use a larger voxel, or allow more anchors"
+        )
+    while len(coordinates) > m.max_anchors:  # ends: at last all points are in one voxel
+        coordinates, voxel_size = voxel_grid(scene.points, COARSER * voxel_size)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.training.seed)
+        model = TrainedModel(
+            config, torch.from_numpy(coordinates), voxel_size, scene.extent, scene.background
+        )
+    neighbours = min(4, len(coordinates))
+    distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(len(coordinates), neighbours)
+    spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(1)
+    with torch.no_grad():
+        model.log_scales.copy_(
+            torch.from_numpy(np.log(np.maximum(spread, 0.1))).float()[:, None].expand(-1, 6)
+        )
+        model.entropy.fit_covariance_prior(model.log_scales)
+        if m.point_colors:
+            logits = torch.from_numpy(logit(colors_at(scene.points, model.positions().numpy()))).float()
+            model.heads.pass_colors(logits.mean(0))
+            model.references[:, :3] = (logits - logits.mean(0)) / config.entropy.reference_step
+    return model
+
+
+def logit(colors: np.ndarray) -> np.ndarray:
+    """Of colors in 0 to 1; black and white have none, and what is nearly so would be far from everything else."""
+    clipped = np.clip(colors, 0.05, 0.95)
+    return np.log(clipped / (1.0 - clipped))

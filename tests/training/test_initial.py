@@ -1,0 +1,58 @@
+"""What training starts from."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from compgs.config import Config, load_config
+from compgs.model.prediction import PredictionHeads, predict
+from compgs.scene.points import colors_at
+from compgs.scene.views import Scene
+from compgs.training.initial import initial_model
+
+
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+def test_before_anything_is_learned_references_pass_as_color_logits(layout: str) -> None:
+    heads = PredictionHeads(8, 4, 16, layout)
+    mean = torch.tensor([0.5, -1.0, 0.25])
+    heads.pass_colors(mean)
+    network = heads.appearance if layout == "paired" else heads.color
+    features = torch.randn(7, 12)
+    kind = "appearance" if layout == "paired" else "color"
+    with torch.no_grad():
+        network.output_weight.zero_()  # the hidden layers; only the skip is left
+        network.skip_weight[8:].zero_()  # of view and residual
+        network.skip_weight[3:8].zero_()  # of the other reference channels
+        raw = heads(kind, features, torch.randn(7, 4), torch.arange(7))
+    torch.testing.assert_close(raw[:, -3:], features[:, :3] + mean)
+
+
+def test_the_first_image_has_the_colors_of_the_points(blob_scene: Scene, tiny_config: Config) -> None:
+    """Random networks add to them; on average over anchors little."""
+    errors = {}
+    for point_colors in (False, True):
+        model_config = replace(tiny_config.model, point_colors=point_colors)
+        model = initial_model(blob_scene, replace(tiny_config, model=model_config))
+        latents = model.quantized()
+        camera = torch.tensor([0.0, -4.0, 0.5])
+        with torch.no_grad():
+            prediction = predict(model.heads, model.primitives(latents), camera, model.distance_unit)
+        anchors = prediction.index // model_config.coupled_primitives
+        wanted = colors_at(blob_scene.points, model.positions().numpy())[anchors.numpy()]
+        errors[point_colors] = float(np.abs(prediction.gaussians.colors.numpy() - wanted).mean())
+    assert errors[True] < 0.5 * errors[False]
+
+
+def test_colors_of_anchors_at_points_are_the_points_and_between_them_lie_between(blob_scene: Scene) -> None:
+    points = blob_scene.points
+    exact = colors_at(points, points.positions.astype(np.float64))
+    np.testing.assert_allclose(exact, points.colors / 255.0, atol=0.02)
+    between = colors_at(points, np.random.default_rng(0).uniform(-1, 1, (50, 3)))
+    assert between.min() >= points.colors.min() / 255.0 and between.max() <= points.colors.max() / 255.0
+
+
+def test_the_paper_preset_starts_from_references_of_zero(blob_scene: Scene) -> None:
+    model = initial_model(blob_scene, load_config("paper"))
+    assert not model.references.any()
