@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from compgs import ssim as ssim_module
-from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer
+from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer, scale_unit
 from compgs.ssim import l1_and_ssim, ssim, window
 
 
@@ -145,6 +145,12 @@ def test_a_rendering_laid_out_otherwise_is_taken():
 def test_the_scale_regularizer_is_the_mean_volume():
     scales = torch.tensor([[1.0, 2.0, 3.0], [0.5, 0.5, 4.0]])
     assert scale_regularizer(scales).item() == pytest.approx(3.5)
+
+
+def test_scales_are_measured_by_the_extent_of_the_scene_and_beyond_it_by_the_distance():
+    means = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 3.0], [1.0, 40.0, 0.0]])
+    unit = scale_unit(means, torch.tensor([1.0, 0.0, 0.0]), 10.0)
+    assert unit.flatten().tolist() == pytest.approx([2.0, 2.0, 8.0])
 
 
 BITS = {

@@ -100,7 +100,7 @@ class TrainingConfig:
     #   the paper; elements: sum over the tensors of mean bits per element (Ref.)
     rate_start: float = 0.1  # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
     ssim_weight: float = 0.2  # (1 - w) L1 + w (1 - SSIM) (3DGS)
-    scale_weight: float = 0.01  # mean product of the primitives' scales (Ref.)
+    scale_weight: float = 0.01  # mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
     embedding_lr: tuple[float, float] = (0.05, 3e-4)  # quantization steps per training step, first and last
     log_scale_lr: tuple[float, float] = (0.007, 0.007)  # Ref.
     translation_lr: tuple[float, float] = (2e-3, 2e-5)  # Ref.

@@ -1,7 +1,7 @@
 """The objective of training (CompGS Sec. 3.3 and 3.4), on one page.
 
     loss = D + lambda R
-    D    = (1 - w) L1 + w (1 - SSIM) + scale_weight * mean product of the primitives' scales
+    D    = (1 - w) L1 + w (1 - SSIM) + scale_weight * mean product of the primitives' scales, in `scale_unit`s
 
 R is made of the bits of the anchors in view, of five streams: reference and residual embeddings, their
 hyperpriors, and the covariance parameters. It can be normalized in two ways:
@@ -27,6 +27,7 @@ from torch import Tensor
 
 from compgs.ssim import l1_and_ssim, ssim
 
+COMMON_EXTENT = 5.0  # world units
 REVIVED = 0.05  # opacity, well above the rasterizer's cutoff
 
 
@@ -83,13 +84,29 @@ class _FusedPhotometric(torch.autograd.Function):
 
 
 def scale_regularizer(scales: Tensor, drawn: Tensor | None = None) -> Tensor:
-    """Mean product of the three scales, [M, 3] world units, of those that are drawn ([M] bool; None: all): large
+    """Mean product of the three scales, [M, 3] in `scale_unit`s, of those that are drawn ([M] bool; None: all): large
     primitives are expensive to render.
     """
     # (a view may see none)
     if drawn is None:
         return scales.prod(1).sum() / max(1, len(scales))
     return (scales.prod(1) * drawn).sum() / drawn.sum().clamp_min(1)
+
+
+def scale_unit(
+    means: Tensor,  # [M, 3] world units
+    camera_center: Tensor,  # [3] world units
+    extent: float,  # of the scene, world units
+) -> Tensor:
+    """[M, 1] world units to measure the scales of primitives in, for the regularizer: a fifth of the scene's extent or,
+    beyond it, of the distance from the camera.
+
+    In world units, as in the authors' release, a scene in meters and the same one in millimeters are two scenes, and
+    where the background is far, its volume is all that counts: the image goes flat. A fifth: scenes scaled as structure
+    from motion leaves them have extents of about five units, and the published weight is for those.
+    """
+    distance = (means.detach() - camera_center).norm(dim=1, keepdim=True)
+    return distance.clamp_min(extent) / COMMON_EXTENT
 
 
 def revival_loss(opacities: Tensor) -> Tensor:

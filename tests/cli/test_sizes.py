@@ -2,9 +2,9 @@
 
 import pytest
 
-from compgs.cli.command import UsageError
 from compgs.cli.console import size
 from compgs.cli.sizes import parse_size
+from compgs.cli.usage import UsageError
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,25 @@
 """Settings from the command line, and how a run remembers them."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from compgs.cli.main import parse
-from compgs.cli.run_folder import RunSettings, SceneSource, file_name, load_settings, save_settings
+from compgs.cli.run_folder import (
+    RunSettings,
+    SceneSource,
+    beginning,
+    file_name,
+    load_settings,
+    save_settings,
+)
 from compgs.cli.settings import parse_value, with_settings
 from compgs.cli.train import CHECKPOINT_NAME, Train, forget_earlier_run, interrupted, say_miss
 from compgs.config import Config, load_config
-from compgs.errors import CheckpointError, ConfigError
+from compgs.errors import CheckpointError, ConfigError, TrainingError
 
 
 def train(*arguments: object) -> Train:
@@ -50,8 +58,8 @@ def test_a_setting_is_read_by_its_type(assignment: str, section: str, key: str, 
         ("training.steps=1.5", "whole number"),
         ("training.steps=", "whole number"),
         ("training.lmbda=a lot", "a number"),
-        ("training.lmbda=nan", "training.lmbda"),
-        ("training.rate=bytes", "bits or elements"),
+        ("training.lmbda=nan", "--lmbda nan: expected 0 to 100"),
+        ("training.rate=bytes", "one of bits, elements"),
         ("training.color_lr=0.1", "2 numbers"),
         ("training.color_lr=0.1,x", "a number"),
         ("trainings.steps=1", "model, entropy, control, training"),
@@ -113,10 +121,42 @@ def test_a_run_is_not_continued_with_other_settings(tmp_path: Path, other: list[
         train("-o", tmp_path, "--resume", *other).settings(tmp_path)
 
 
-def test_resuming_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
-    save_settings(tmp_path, train("scene", "-o", tmp_path).settings(tmp_path))
-    with pytest.raises(CheckpointError, match=r"checkpoint"):
-        train("-o", tmp_path, "--resume").settings(tmp_path)
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins_again_as_it_began(tmp_path: Path) -> None:
+    begun = train("scene", "-o", tmp_path, "--steps", "77").settings(tmp_path)
+    save_settings(tmp_path, begun)
+    again = train("-o", tmp_path, "--resume")
+    assert again.settings(tmp_path) == begun
+    assert not again.continues(tmp_path)
+    (tmp_path / CHECKPOINT_NAME).touch()
+    assert again.continues(tmp_path)
+
+
+@pytest.mark.parametrize("failure", [TrainingError, KeyboardInterrupt, MemoryError])
+def test_a_run_that_fails_before_its_first_checkpoint_leaves_nothing(
+    tmp_path: Path, failure: type[BaseException]
+) -> None:
+    folder = tmp_path / "runs" / "garden"
+    settings = train("scene", "-o", folder).settings(folder)
+    with pytest.raises(failure), beginning(folder, settings):
+        assert load_settings(folder) == settings
+        raise failure
+    assert list(tmp_path.iterdir()) == []
+    folder.mkdir(parents=True)
+    (folder / "notes.txt").touch()
+    with pytest.raises(failure), beginning(folder, settings):
+        raise failure
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+def test_a_run_that_fails_after_a_checkpoint_can_be_continued(tmp_path: Path) -> None:
+    settings = train("scene", "-o", tmp_path).settings(tmp_path)
+    with pytest.raises(TrainingError), beginning(tmp_path, settings):
+        (tmp_path / CHECKPOINT_NAME).touch()
+        raise TrainingError
+    elsewhere = replace(settings, scene=replace(settings.scene, path="elsewhere"))
+    with pytest.raises(TrainingError), beginning(tmp_path, elsewhere):
+        raise TrainingError
+    assert load_settings(tmp_path) == settings
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"preset": "quick", "scene": {}, "settings": {}}'])
@@ -148,7 +188,7 @@ def test_overwriting_removes_what_could_be_taken_for_the_new_run(tmp_path: Path)
 
 
 def test_someone_who_stops_a_run_is_told_how_to_go_on(tmp_path: Path) -> None:
-    assert "before the first checkpoint" in interrupted(tmp_path)
+    assert "nothing was kept" in interrupted(tmp_path)
     (tmp_path / CHECKPOINT_NAME).touch()
     assert f"compgs train -o {tmp_path} --resume" in interrupted(tmp_path)
 

@@ -220,9 +220,9 @@ def test_absurd_counts_are_refused_before_anything_is_allocated(count: int) -> N
     [
         (b"\x16\0\0\0", "22 levels"),
         (b"\xff\0\0\0", "255 levels"),
-        (b"\x04\x80\x80", "x is not a number"),
-        (b"\x04\0\xff\xff\xff\xff\xff", "y is not a number"),
-        (b"\x04\0\0\x80\0", "z has superfluous bytes"),
+        (b"\x04\x80\x80", "axis x needs 1 bytes"),
+        (b"\x04\0\xff\xff\xff\xff\x01", "axis y is .*, expected -134217728 to 134217727"),
+        (b"\x04\0\0\x80\0", "axis z is spelled with a needless zero byte"),
         (b"\x01\0\0\0", "9 anchors in an octree of 1 levels"),
     ],
 )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import compgs
 from compgs.cli import train as train_command
@@ -124,6 +125,27 @@ def test_info_and_render_need_nothing_but_the_file(run: Path, tmp_path: Path) ->
     in_a_new_process("render", file, "--cameras", run / "cameras.json", "-o", tmp_path / "views")
     for image in (run / "test" / "renders").iterdir():
         assert image.read_bytes() == (tmp_path / "views" / image.name).read_bytes()
+
+
+def test_a_background_that_is_asked_for_takes_the_place_of_the_files_own(run: Path, tmp_path: Path) -> None:
+    """Seen from a camera that has turned its back on the scene."""
+    cameras = json.loads((run / "cameras.json").read_text())[:1]
+    away = np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.array(cameras[0]["world_to_camera"])
+    away[2, 3] -= 1000.0
+    cameras[0]["world_to_camera"] = away.tolist()
+    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
+    for option, color in ((["--background", "1", "0", "0.2"], (255, 0, 51)), ([], (0, 0, 0))):
+        output = tmp_path / f"out{len(option)}"
+        command = [
+            "render",
+            str(run / "tiny.cgs"),
+            "--cameras",
+            str(tmp_path / "cameras.json"),
+            "-o",
+            str(output),
+        ]
+        assert main([*command, *option]) == 0
+        assert (np.asarray(Image.open(output / "00000.png")) == color).all()
 
 
 def test_python_does_the_same_and_the_same_seed_gives_the_same_file(

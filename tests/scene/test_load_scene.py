@@ -13,6 +13,7 @@ from compgs.cameras import Camera
 from compgs.errors import ConfigError
 from compgs.scene import View, load_scene
 from compgs.scene.colmap import ColmapCamera, read_sparse_model
+from compgs.scene.colmap_writer import write_sparse_model
 from compgs.scene.rotations import rotation_from_quaternion
 
 Write = Callable[..., Path]
@@ -221,6 +222,17 @@ def test_too_few_points_are_completed_by_random_ones_and_said_so(write_capture: 
     assert len(scene.points) > 1000
     assert np.isfinite(scene.points.positions).all()
     np.testing.assert_array_equal(load_scene(folder).points.positions, scene.points.positions)
+
+
+def test_copies_of_a_point_are_one_point(write_capture: Write) -> None:
+    folder = write_capture(points=150)
+    sparse = folder / "sparse" / "0"
+    model = read_sparse_model(sparse)
+    copies = replace(model.points, positions=np.tile(model.points.positions[:3], (50, 1)))
+    write_sparse_model(sparse, model.cameras.values(), model.images, copies)
+    scene = load_scene(folder)
+    assert "has 3 points in different places, too few" in scene.notes[0]
+    assert len(np.unique(scene.points.positions, axis=0)) > 1000
 
 
 def test_a_hundred_points_are_enough(write_capture: Write) -> None:

@@ -7,13 +7,10 @@ from typing import Annotated
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.run_folder import SceneSource
+from compgs.cli.usage import UsageError, check_range, settings_of_options
 from compgs.errors import ConfigError
 
 NO_DEFAULT = ""  # instead of "(default: None)" in the help
-
-
-class UsageError(ConfigError):
-    """The command line cannot be understood as it stands."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +78,16 @@ class ReadingOptions:
     """Color behind everything, 0 to 1; by default white for Blender scenes, else black."""
 
     def source_at(self, path: Path, *, holdout: bool = True) -> SceneSource:
+        """Raises UsageError for options that no scene could be read by."""
+        self.check_reading()
         return SceneSource(str(path), self.downscale, self.images, self.test_every, holdout, self.background)
+
+    def check_reading(self) -> None:
+        """Raises UsageError."""
+        from compgs.scene import check_reading
+
+        with settings_of_options():
+            check_reading(self.downscale, self.test_every, self.background)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,8 +123,7 @@ def use_threads(count: int) -> None:
     import torch
 
     limit = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    if not 1 <= count <= limit:
-        raise UsageError(f"--threads {count}: expected 1 to {limit}")
+    check_range("--threads", count, 1, limit)
     numba.set_num_threads(count)
     torch.set_num_threads(count)
 

@@ -8,9 +8,10 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from compgs.cli.command import Command, UsageError
+from compgs.cli.command import Command
 from compgs.cli.console import say
 from compgs.cli.progress import counting
+from compgs.cli.usage import check_range
 from compgs.errors import OutputError
 from compgs.outputs import check_output_folder
 
@@ -43,12 +44,10 @@ class DemoScene(Command):
     """Replace a scene that is in FOLDER already."""
 
     def run(self) -> None:
-        if not (
-            2 <= self.views <= 10_000
-            and min(self.width, self.height) >= 16
-            and max(self.width, self.height) <= 8192
-        ):
-            raise UsageError("--views must be 2 to 10000, --width and --height 16 to 8192")
+        check_range("--views", self.views, 2, 10_000)
+        check_range("--width", self.width, 16, 8192)
+        check_range("--height", self.height, 16, 8192)
+        check_range("--seed", self.seed, 0, 2**31 - 1)
         check_output_folder(self.folder, overwrite=self.overwrite)
         if self.overwrite:
             check_only_a_scene(self.folder)

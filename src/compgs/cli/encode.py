@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from compgs.cli.command import ComputingCommand, ReadingOptions, UsageError
+from compgs.cli.command import ComputingCommand, ReadingOptions
 from compgs.cli.console import duration, print_components, print_reduction, say, size
 from compgs.cli.inputs import check_bitstream, read_bitstream
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import CHECKPOINT_NAME, SceneSource, file_name, load_settings
 from compgs.cli.scenes import read_scene
+from compgs.cli.usage import UsageError, settings_of_options
 from compgs.errors import CheckpointError
 from compgs.outputs import check_output_file, write_bytes
 
@@ -87,10 +88,12 @@ class Encode(ComputingCommand, ReadingOptions):
 
     def check(self) -> Path:
         """The file to write. Raises what can be said before anything is computed."""
+        self.check_reading()
         if self.reduces:
             from compgs.evaluation.reduction import check_reduction
 
-            check_reduction(self.drop, self.coarser)
+            with settings_of_options():
+                check_reduction(self.drop, self.coarser)
         if self.source.is_dir():
             path = self.output or self.source / file_name(self.source)
             check_output_file(path, overwrite=self.overwrite)

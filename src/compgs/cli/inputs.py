@@ -34,6 +34,10 @@ def read_bitstream(path: Path) -> bytes:
         raise NotACompGSFile(f"{path}: expected a .cgs file, found a folder{hint}")
     if not path.is_file():
         raise NotACompGSFile(f"{path}: there is no such file")
+    if path.suffix.lower() == ".ply":
+        raise NotACompGSFile(
+            f"{path}: expected a .cgs file; .ply files can be rendered and evaluated, no more"
+        )
     try:
         return path.read_bytes()
     except OSError as error:

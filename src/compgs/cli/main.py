@@ -1,19 +1,18 @@
 """`compgs`: dispatch to a command; errors become one clear message and an exit code.
 
-Exit codes: 0 done; 1 something is wrong with the input, the settings, the output or the file; 2 the command
-line could not be understood; 130 stopped by the user.
+Exit codes: 0 done; 1 something is wrong with the input, the output or the file; 2 the command line could not be
+understood, or has a value that is out of range; 130 stopped by the user.
 """
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated
 
-import tyro
 from rich.markup import escape
 from rich.table import Table
 
 from compgs import __version__
-from compgs.cli.command import Command, UsageError
+from compgs.cli.arguments import command_name, parse_command
+from compgs.cli.command import Command
 from compgs.cli.console import console, errors
 from compgs.cli.decode import Decode
 from compgs.cli.demo_scene import DemoScene
@@ -22,6 +21,7 @@ from compgs.cli.evaluate import Evaluate
 from compgs.cli.info import Info
 from compgs.cli.render import Render
 from compgs.cli.train import Train
+from compgs.cli.usage import UsageError
 from compgs.errors import CompGSError
 
 COMMANDS: tuple[type[Command], ...] = (Train, Encode, Decode, Render, Evaluate, Info, DemoScene)
@@ -44,18 +44,9 @@ def print_help() -> None:
     console.print(f"A first try: {EXAMPLE}")
 
 
-def command_name(command: type[Command]) -> str:
-    """`DemoScene` is `demo-scene`."""
-    return "".join(f"-{c.lower()}" if c.isupper() else c for c in command.__name__).lstrip("-")
-
-
-def parse(arguments: Sequence[str]) -> Command:
-    """Raises SystemExit: 2 for a line that is not understood, 0 for a command's --help."""
-    commands = Annotated[
-        Train | Encode | Decode | Render | Evaluate | Info | DemoScene,
-        tyro.conf.configure(tyro.conf.OmitArgPrefixes),
-    ]
-    return tyro.cli(commands, prog="compgs", args=list(arguments))
+def parse(words: Sequence[str]) -> Command:
+    """Raises UsageError for words that are not understood, SystemExit(0) after a command's --help."""
+    return parse_command(COMMANDS, words)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,8 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     try:
         command = parse(given)
-    except SystemExit as stop:
-        return int(stop.code or 0)
+    except SystemExit:
+        return 0
+    except UsageError as error:
+        return fail(error)
     return run(command)
 
 
@@ -81,12 +74,17 @@ def run(command: Command) -> int:
     except (CompGSError, OSError, MemoryError) as error:
         if command.debug:
             raise
-        errors.print(f"[bold red]error:[/] {escape(explain(error))}")
-        return 2 if isinstance(error, UsageError) else 1
+        return fail(error)
     except KeyboardInterrupt as stop:
         errors.print(escape(str(stop) or "interrupted"))
         return 130
     return 0
+
+
+def fail(error: Exception) -> int:
+    """Says what is wrong; the exit code."""
+    errors.print(f"[bold red]error:[/] {escape(explain(error))}")
+    return 2 if isinstance(error, UsageError) else 1
 
 
 def explain(error: Exception) -> str:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from compgs.cli.usage import OPTIONS, UsageError
 from compgs.config import Config
-from compgs.errors import ConfigError
 
 if TYPE_CHECKING:
     from compgs.model.splats import SplatModel
@@ -62,18 +62,16 @@ METHODS = {
         _write_splats,
     ),
 }
-# Settings that have an option of their own, which may be refused.
-OPTIONS = {"training.lmbda": "--lmbda", "training.target_bytes": "--target-size"}
 
 
 def check_settings_of(method: str, assignments: Iterable[str]) -> None:
-    """Of `section.key=value` assignments: raises ConfigError for one that the method would not look at."""
+    """Of `section.key=value` assignments: raises UsageError for one that the method would not look at."""
     known = METHODS[method].settings
     for assignment in assignments:
         name = assignment.partition("=")[0].strip()
         section = name.partition(".")[0]
         if section in Config().to_dict() and section not in known and name not in known:
             ours = ", ".join(f"{k}.*" if "." not in k else k for k in known)
-            raise ConfigError(
+            raise UsageError(
                 f"{OPTIONS.get(name, f'--set {name}')}: not a setting of --method {method}, which has {ours}"
             )

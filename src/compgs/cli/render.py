@@ -1,18 +1,20 @@
 """`compgs render`: images from a file."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions, UsageError
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions
 from compgs.cli.console import duration, say
 from compgs.cli.inputs import check_scene_file
 from compgs.cli.progress import counting
 from compgs.cli.scenes import read_scene
+from compgs.cli.usage import UsageError, check_range
 from compgs.outputs import check_output_folder, write_bytes, write_json
 
 if TYPE_CHECKING:
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from compgs.scene import Scene
 
 BLACK = (0.0, 0.0, 0.0)
+MAX_SIDE = 16_384  # pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +45,12 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
 
     output: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER")]
     """Folder for the images."""
+
+    background: Annotated[
+        tuple[float, float, float] | None, arg(metavar="R G B", help_behavior_hint=NO_DEFAULT)
+    ] = None
+    """Color behind everything, 0 to 1, in place of the file's own; a .ply file has none: by default the scene's, or
+    black."""
 
     split: Literal["test", "train", "all"] = "test"
     """Which views of the scene: held out, trained on, or both."""
@@ -71,17 +80,11 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
     """Replace images that are in FOLDER already."""
 
     def run(self) -> None:
+        self.check_values()
         check_scene_file(self.file)
         check_output_folder(self.output, overwrite=self.overwrite)
         if self.cameras is not None and (self.scene or self.source):
             raise UsageError("both a scene and --cameras were given; give one")
-        if (
-            not 1 <= self.frames <= 100_000
-            or not 1 <= min(self.width, self.height) <= max(self.width, self.height) <= 16_384
-        ):
-            raise UsageError("--frames must be 1 to 100000, --width and --height 1 to 16384")
-        if not -89 <= self.elevation <= 89 or not 0 < self.distance < float("inf"):
-            raise UsageError("--elevation must be -89 to 89 degrees, --distance above 0")
         self.prepare()
         import torch
 
@@ -89,11 +92,23 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
 
         scene = read_scene(self.scene_source()) if self.scene or self.source else None
         views = self.given_views(scene)
-        # Of .ply files alone: a .cgs file has its own.
-        background = scene.background if scene else self.background or BLACK
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
-        model = open_scene_file(self.file, device, background)
+        model = open_scene_file(self.file, device, scene.background if scene else BLACK)
+        if self.background is not None:
+            model = replace(model, background=self.background)
         self.render(model, views or self.circle(model))
+
+    def check_values(self) -> None:
+        """Raises UsageError."""
+        self.check_reading()
+        check_range("--frames", self.frames, 1, 100_000)
+        check_range("--width", self.width, 1, MAX_SIDE)
+        check_range("--height", self.height, 1, MAX_SIDE)
+        check_range("--elevation", self.elevation, -89, 89)
+        if not 0 < self.distance < float("inf"):
+            raise UsageError(f"--distance {self.distance}: expected a finite number above 0")
+        if not any(self.up) or not all(map(math.isfinite, self.up)):
+            raise UsageError(f"--up {' '.join(map(str, self.up))}: expected a direction, not all of it zero")
 
     def given_views(self, scene: "Scene | None") -> "Sequence[tuple[str, Camera]]":
         """Names and cameras of the scene or camera file; none if neither was given."""

@@ -1,6 +1,8 @@
 """A run's folder: what `compgs train` leaves there, and `config.json`, which says how it came about."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -53,6 +55,28 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
         "settings": settings.config.to_dict(),
     }
     write_json(folder / SETTINGS_NAME, content)
+
+
+@contextmanager
+def beginning(folder: Path, settings: RunSettings) -> Iterator[None]:
+    """A run begins: its settings are there before its first checkpoint is. If it fails without one, nothing stays.
+
+    A run that has a checkpoint has begun before. Raises OutputError.
+    """
+    if (folder / CHECKPOINT_NAME).exists():
+        yield
+        return
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    save_settings(folder, settings)
+    try:
+        yield
+    except BaseException:
+        if not (folder / CHECKPOINT_NAME).exists():
+            with suppress(OSError):
+                (folder / SETTINGS_NAME).unlink()
+                for path in made:
+                    path.rmdir()
+        raise
 
 
 def load_settings(folder: Path) -> RunSettings:

@@ -5,33 +5,34 @@ import typing
 from collections.abc import Iterable
 from typing import Any
 
+from compgs.cli.usage import UsageError, settings_of_options
 from compgs.config import Config, config_from_dict
-from compgs.errors import ConfigError
 
 
 def with_settings(config: Config, assignments: Iterable[str]) -> Config:
-    """The config with `section.key=value` assignments applied, checked. Raises ConfigError."""
+    """The config with `section.key=value` assignments applied, checked. Raises UsageError."""
     values = config.to_dict()
     kinds = typing.get_type_hints(Config)
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         section, dot, key = name.strip().partition(".")
         if not (equals and dot):
-            raise ConfigError(f"--set {assignment}: expected section.key=value, as in training.steps=5000")
+            raise UsageError(f"--set {assignment}: expected section.key=value, as in training.steps=5000")
         if section not in kinds:
-            raise ConfigError(
+            raise UsageError(
                 f"--set {assignment}: there is no section {section!r}; there are {', '.join(kinds)}"
             )
         hints = typing.get_type_hints(kinds[section])
         if key not in hints:
-            raise ConfigError(
+            raise UsageError(
                 f"--set {assignment}: there is no setting {key!r}; {section} has {', '.join(hints)}"
             )
         try:
             values[section][key] = parse_value(hints[key], text.strip())
         except ValueError as error:
-            raise ConfigError(f"--set {assignment}: {error}") from error
-    return config_from_dict(values, "--set")
+            raise UsageError(f"--set {assignment}: {error}") from error
+    with settings_of_options():
+        return config_from_dict(values, "--set")
 
 
 def parse_value(kind: Any, text: str) -> Any:
@@ -39,7 +40,7 @@ def parse_value(kind: Any, text: str) -> Any:
     origin, options = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Literal:
         if text not in options:
-            raise ValueError(f"expected {' or '.join(map(str, options))}, found {text!r}")
+            raise ValueError(f"expected one of {', '.join(map(str, options))}, found {text!r}")
         return text
     if origin in (types.UnionType, typing.Union):
         if text.lower() == "none":

@@ -2,7 +2,7 @@
 
 import re
 
-from compgs.cli.command import UsageError
+from compgs.cli.usage import UsageError
 
 UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30}
 

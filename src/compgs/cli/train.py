@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, UsageError, one_scene
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, one_scene
 from compgs.cli.console import duration, print_profile, print_results, say, size
 from compgs.cli.methods import METHODS, check_settings_of
 from compgs.cli.progress import counting, training
@@ -17,15 +17,16 @@ from compgs.cli.run_folder import (
     CHECKPOINT_NAME,
     TRAINING_NAME,
     RunSettings,
+    beginning,
     file_name,
     load_settings,
-    save_settings,
 )
 from compgs.cli.scenes import read_scene
 from compgs.cli.settings import with_settings
 from compgs.cli.sizes import parse_size
+from compgs.cli.usage import UsageError, settings_of_options
 from compgs.config import load_config
-from compgs.errors import CheckpointError, ConfigError, OutputError
+from compgs.errors import OutputError
 from compgs.outputs import check_output_folder, write_json
 
 if TYPE_CHECKING:
@@ -122,10 +123,12 @@ class Train(ComputingCommand, SceneOptions):
         settings = self.settings(folder)
         self.prepare()
         scene = read_scene(settings.scene)
+        if self.resume and not self.continues(folder):
+            say("the run was stopped before its first checkpoint: it begins again, with the same settings")
         if not self.resume:
             forget_earlier_run(folder)
-            save_settings(folder, settings)
-        model = self.train(scene, settings, folder)
+        with beginning(folder, settings):
+            model = self.train(scene, settings, folder)
         path = folder / file_name(folder, METHODS[settings.method].extension)
         start = time.perf_counter()
         written = METHODS[settings.method].write(model, path)
@@ -134,29 +137,31 @@ class Train(ComputingCommand, SceneOptions):
         if settings.config.training.target_bytes is not None:
             say_miss(folder, settings.config.training.target_bytes)
 
+    def continues(self, folder: Path) -> bool:
+        """There is a checkpoint to go on from, and it is asked for."""
+        return self.resume and (folder / CHECKPOINT_NAME).is_file()
+
     def settings(self, folder: Path) -> RunSettings:
-        """From the command line, or of the run to be continued. Raises ConfigError, CheckpointError."""
+        """From the command line, or of the run to be continued. Raises UsageError, CheckpointError."""
         if not self.resume:
             preset, method = self.preset or "default", self.method or "compgs"
             source = self.scene_source(holdout=self.eval)
             check_settings_of(method, self.assignments())
-            config = with_settings(load_config(preset), self.assignments())
+            with settings_of_options():
+                start = load_config(preset)
+            config = with_settings(start, self.assignments())
             return RunSettings(preset, source, config, method)
         begun = load_settings(folder)
-        if not (folder / CHECKPOINT_NAME).is_file():
-            raise CheckpointError(
-                f"{folder / CHECKPOINT_NAME}: not found; the run wrote no checkpoint, train anew"
-            )
         if self.scene or self.source:
             # The data may have moved; whether it is the same scene, the checkpoint knows.
             begun = replace(begun, scene=replace(begun.scene, path=str(one_scene(self.scene, self.source))))
         if self.method not in (None, begun.method):
-            raise ConfigError(f"--method {self.method}: the run to continue began with {begun.method}")
+            raise UsageError(f"--method {self.method}: the run to continue began with {begun.method}")
         if self.preset not in (None, begun.preset):
-            raise ConfigError(f"--preset {self.preset}: the run to continue began with preset {begun.preset}")
+            raise UsageError(f"--preset {self.preset}: the run to continue began with preset {begun.preset}")
         changed = with_settings(begun.config, self.assignments())
         if changed != begun.config:
-            raise ConfigError(
+            raise UsageError(
                 "--resume continues with the settings the run began with; other ones need a new run"
             )
         return begun
@@ -177,6 +182,7 @@ class Train(ComputingCommand, SceneOptions):
 
         profile = StepProfile() if self.profile else None
         last: TrainingStatus | None = None
+        continues = self.continues(folder)
         start = time.perf_counter()
         try:
             with training() as show:
@@ -190,7 +196,7 @@ class Train(ComputingCommand, SceneOptions):
                     scene,
                     settings.config,
                     output=folder,
-                    resume=self.resume,
+                    resume=continues,
                     on_progress=on_progress,
                     device=self.device,
                     profile=profile,
@@ -208,7 +214,7 @@ class Train(ComputingCommand, SceneOptions):
                     **({"lmbda": last.lmbda} if last.lmbda is not None else {}),
                     "seconds": seconds,
                     "seconds_per_step": last.seconds_per_step,
-                    "resumed": self.resume,
+                    "resumed": continues,
                     **({"milliseconds_per_step": profile.milliseconds()} if profile else {}),
                 },
             )
@@ -271,6 +277,6 @@ def interrupted(folder: Path) -> str:
     """What to tell someone who stopped a training."""
     checkpoint = folder / CHECKPOINT_NAME
     if not checkpoint.is_file():
-        return "interrupted before the first checkpoint: start again with --overwrite"
+        return "interrupted before the first checkpoint: nothing was kept"
     command = f"compgs train -o {shlex.quote(str(folder))} --resume"
     return f"interrupted; the checkpoint is {checkpoint}\ncontinue with: {command}"

@@ -46,6 +46,7 @@ from compgs.codec.binary_coder import (
     start_decoder,
     start_encoder,
 )
+from compgs.codec.fields import FieldReader, signed_varint
 from compgs.errors import CorruptSection, NotEncodable
 
 __all__ = ["ANCHORS_PER_BYTE", "MAXIMUM_ANCHORS", "decode_positions", "encode_positions"]
@@ -526,7 +527,7 @@ def encode_positions(coordinates: NDArray[np.int32]) -> bytes:
     if length > len(buffer):  # never seen; the worst case is far above the usual
         buffer = np.empty(length, np.uint8)
         length, _ = _code_tree(buffer, codes, count, depth, decoding=False)
-    header = bytes([depth]) + b"".join(_varint(int(v) >> ALIGNMENT_BITS) for v in origin)
+    header = bytes([depth]) + b"".join(signed_varint(int(v) >> ALIGNMENT_BITS) for v in origin)
     payload = header + buffer[:length].tobytes()
     return payload.ljust(_least_bytes(count), b"\0")
 
@@ -572,37 +573,12 @@ def _least_bytes(count: int) -> int:
     return -(-count // ANCHORS_PER_BYTE)
 
 
-def _varint(value: int) -> bytes:
-    """Zigzag (0, -1, 1, -2 -> 0, 1, 2, 3), 7 bits a byte, lowest first; the top bit says that more follow."""
-    rest = 2 * value if value >= 0 else -2 * value - 1
-    out = bytearray()
-    while rest >= 128:
-        out.append(rest & 127 | 128)
-        rest >>= 7
-    out.append(rest)
-    return bytes(out)
-
-
 def _read_header(data: bytes) -> tuple[int, NDArray[np.int64], int]:
     """Depth, origin [3] and the place after them."""
-    depth, at = data[0], 1
+    reader = FieldReader(data, "anchor positions")
+    (depth,) = reader.bytes(1, "depth")
     if depth > MAXIMUM_DEPTH:
         raise CorruptSection(f"anchor positions: octree of {depth} levels, at most {MAXIMUM_DEPTH} exist")
-    origin = np.zeros(3, np.int64)
-    for axis in range(3):
-        value, shift = 0, 0
-        while True:
-            if at == len(data) or shift > 21:
-                raise CorruptSection(
-                    f"anchor positions: origin of axis {'xyz'[axis]} is not a number of 28 bits"
-                )
-            byte = data[at]
-            value |= (byte & 127) << shift
-            at += 1
-            shift += 7
-            if byte < 128:
-                break
-        if shift > 7 and byte == 0:
-            raise CorruptSection(f"anchor positions: origin of axis {'xyz'[axis]} has superfluous bytes")
-        origin[axis] = (value >> 1 if value & 1 == 0 else -(value >> 1) - 1) << ALIGNMENT_BITS
-    return depth, origin, at
+    limit = 1 << 27  # 28 bits with the sign
+    origin = [reader.signed_varint(f"origin of axis {axis}", -limit, limit - 1) for axis in "xyz"]
+    return depth, np.array(origin, np.int64) << ALIGNMENT_BITS, reader.position

@@ -37,14 +37,7 @@ def load_scene(
 
     Raises SceneError or one of its kinds for missing, damaged or contradicting data, else ConfigError.
     """
-    if not 1 <= downscale <= MAX_DOWNSCALE or int(downscale) != downscale:
-        raise ConfigError(
-            f"downscale {downscale}: expected a whole number from 1 to {MAX_DOWNSCALE}, a factor, not a width"
-        )
-    if test_every < 2:
-        raise ConfigError(f"test_every {test_every}: expected at least 2, so that views are left to train on")
-    if background is not None and not (len(background) == 3 and all(0 <= c <= 1 for c in background)):
-        raise ConfigError(f"background {background}: expected three numbers from 0 to 1")
+    check_reading(downscale, test_every, background)
     folder = Path(path)
     capture = _read_layout(folder, images)
     _check_views(capture, folder)
@@ -64,6 +57,18 @@ def load_scene(
         source=folder,
         notes=capture.notes + notes,
     )
+
+
+def check_reading(downscale: int, test_every: int, background: tuple[float, float, float] | None) -> None:
+    """Of the arguments of `load_scene`: raises ConfigError for the first that no scene could be read by."""
+    if not 1 <= downscale <= MAX_DOWNSCALE or int(downscale) != downscale:
+        raise ConfigError(
+            f"downscale {downscale}: expected a whole number from 1 to {MAX_DOWNSCALE}, a factor, not a width"
+        )
+    if test_every < 2:
+        raise ConfigError(f"test_every {test_every}: expected at least 2, so that views are left to train on")
+    if background is not None and not (len(background) == 3 and all(0 <= c <= 1 for c in background)):
+        raise ConfigError(f"background {background}: expected three numbers from 0 to 1")
 
 
 def _read_layout(folder: Path, images: str) -> Capture:
@@ -130,7 +135,7 @@ def _held_out(capture: Capture, test_every: int) -> frozenset[str]:
 
 
 def _enough_points(capture: Capture, views: list[View]) -> tuple[Points, tuple[str, ...]]:
-    found = len(capture.points)
+    found = _different(capture.points.positions)
     if found >= MIN_POINTS:
         return capture.points, ()
     random = fallback_points([view.camera for view in views], FALLBACK_POINTS)
@@ -139,10 +144,16 @@ def _enough_points(capture: Capture, views: list[View]) -> tuple[Points, tuple[s
         np.concatenate([capture.points.colors, random.colors]),
     )
     note = (
-        f"{capture.points_source} has {found} points, too few to start from: {len(random)} random ones were "
-        f"added where the cameras look"
+        f"{capture.points_source} has {found} points in different places, too few to start from: "
+        f"{len(random)} random ones were added where the cameras look"
     )
     return both, (note,)
+
+
+def _different(positions: np.ndarray) -> int:  # positions: [P, 3]
+    """Number of different positions, of at least `MIN_POINTS` perhaps not all."""
+    few = len(np.unique(positions[: 10 * MIN_POINTS], axis=0))
+    return few if few >= MIN_POINTS else len(np.unique(positions, axis=0))
 
 
 def _extent(views: list[View], points: Points) -> float:

@@ -5,19 +5,30 @@ import torch
 from scipy.spatial import cKDTree
 
 from compgs.config import Config
+from compgs.errors import ConfigError
 from compgs.scene.points import colors_at, median_spacing, voxel_grid
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
+
+COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
 
 
 def initial_model(scene: Scene, config: Config) -> TrainedModel:
     """Anchors on the voxel grid of the scene's points (CompGS Sec. 3.4), as large as the distance to their neighbours.
 
     With `point_colors` they have the points' colors, too: from gray, hundreds of steps would go into finding them.
+    Raises ConfigError if the voxel size that was asked for gives more than `max_anchors`.
     """
     m = config.model
     wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
     coordinates, voxel_size = voxel_grid(scene.points, wanted)
+    if m.voxel_size and len(coordinates) > m.max_anchors:
+        raise ConfigError(
+            f"model.voxel_size = {m.voxel_size}: the scene's points fill {len(coordinates)} voxels, "
+            f"model.max_anchors is {m.max_anchors}; use a larger voxel, or allow more anchors"
+        )
+    while len(coordinates) > m.max_anchors:  # ends: at last all points are in one voxel
+        coordinates, voxel_size = voxel_grid(scene.points, COARSER * voxel_size)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.training.seed)
         model = TrainedModel(

@@ -96,6 +96,11 @@ def next_view(order: list[int], views: int, shuffle: np.random.Generator) -> int
     return order.pop()
 
 
+def diverged(step: int, what: str, value: float) -> TrainingError:
+    """For a value that is not finite any more."""
+    return TrainingError(f"step {step}: the {what} is {value}; try a lower learning rate or another seed")
+
+
 def run_to_end(
     trainer: Trains,
     config: TrainingConfig,
@@ -110,7 +115,11 @@ def run_to_end(
             with held_back():
                 result = trainer.train_step()
             now = time.perf_counter()
-            if on_progress and (trainer.step % REPORT_EVERY == 0 or trainer.step == config.steps):
+            told = trainer.step % REPORT_EVERY == 0 or trainer.step == config.steps
+            # Before anything is computed from what has diverged.
+            if told and not torch.isfinite(result.loss):
+                raise diverged(trainer.step, "loss", float(result.loss))
+            if on_progress and told:
                 if trainer.step % ESTIMATE_EVERY == 0 or not estimate:
                     estimate = trainer.estimated_bytes()
                 recent = (now - reported) / (trainer.step - counted)
@@ -118,10 +127,6 @@ def run_to_end(
                 pace = recent if not pace or recent < 0.5 * pace else 0.9 * pace + 0.1 * recent
                 reported, counted = now, trainer.step
                 on_progress(_status(trainer, config.steps, result, estimate, pace))
-            if trainer.step % REPORT_EVERY == 0 and not torch.isfinite(result.loss):
-                raise TrainingError(
-                    f"step {trainer.step}: the loss is {float(result.loss)}; try a lower learning rate or another seed"
-                )
             if path and now - saved > 60 * config.checkpoint_minutes:
                 trainer.save(path)
                 saved = now

@@ -22,6 +22,7 @@ from compgs.losses import (
     rate_distortion_loss,
     revival_loss,
     scale_regularizer,
+    scale_unit,
 )
 from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
 from compgs.render import RasterSettings, contributions, rasterize, visible_mask
@@ -42,6 +43,7 @@ from compgs.training.loop import (
     TrainingStatus,
     checkpoint_path,
     chosen_device,
+    diverged,
     kept_target,
     next_view,
     run_to_end,
@@ -151,7 +153,8 @@ class Trainer:
         if self.schedule.active(self.step):
             rendered.means2d.retain_grad()
         distortion = photometric_loss(rendered.image, self.target(view_index), t.ssim_weight)
-        loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales, prediction.drawn)
+        unit = scale_unit(gaussians.means, camera_center(view.camera, self.device), self.scene.extent)
+        loss = distortion + t.scale_weight * scale_regularizer(gaussians.scales / unit, prediction.drawn)
         loss = loss + self.revival(prediction)
         profile.lap("loss")
         if latents.bits:
@@ -270,7 +273,8 @@ class Trainer:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         if not any(len(self.visible_anchors(view.camera)) for view in self.scene.train_views):
             raise TrainingError(
-                f"{self.scene.name}: no view sees any of the scene's points; are the poses right?"
+                f"{self.scene.name}: no view sees any of the scene's points from farther than "
+                f"{self.settings.near_plane} world units; are the poses right, and the unit of length?"
             )
         run_to_end(self, self.config.training, path, on_progress)
 
@@ -287,10 +291,12 @@ class Trainer:
         return self.rate.lmbda
 
     def estimated_bytes(self) -> int:
-        """Of the file, were it written now."""
+        """Of the file, were it written now. Raises TrainingError if the latents are not finite any more."""
         model = self.model
         anchors = int(model.mask.any(1).sum())
         bits = sum(model.estimated_bits().values()) + POSITION_BITS * anchors
+        if not math.isfinite(bits):
+            raise diverged(self.step, "rate", bits)
         return int(bits / 8) + self.fixed_bytes()
 
     @torch.no_grad()

@@ -1,0 +1,44 @@
+"""What is wrong with a command line, in the words of its options."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from compgs.errors import ConfigError
+
+# Settings that have an option of their own.
+OPTIONS = {
+    "training.lmbda": "--lmbda",
+    "training.target_bytes": "--target-size",
+    "training.steps": "--steps",
+    "training.seed": "--seed",
+}
+
+
+class UsageError(ConfigError):
+    """The command line cannot be understood as it stands, or asks for a value that is out of range."""
+
+
+def check_range(option: str, value: float, low: float, high: float) -> None:
+    """Raises UsageError for a value that is not a number from `low` to `high`."""
+    if not low <= value <= high:
+        raise UsageError(f"{option} {value}: expected {low} to {high}")
+
+
+@contextmanager
+def settings_of_options() -> Iterator[None]:
+    """A ConfigError of a setting that was given on the command line becomes a UsageError of the option."""
+    try:
+        yield
+    except UsageError:
+        raise
+    except ConfigError as error:
+        raise UsageError(_in_words_of_options(str(error))) from error
+
+
+def _in_words_of_options(message: str) -> str:
+    """`training.steps = 0: ...` is `--steps 0: ...`; where there is no such option, `--set training.steps=0: ...`."""
+    name, _, rest = message.partition(" ")
+    rest = rest.removeprefix("= ")
+    if name in OPTIONS:
+        return f"{OPTIONS[name]} {rest}"
+    return f"--set {name}={rest}" if "." in name else f"--{name.replace('_', '-')} {rest}"
