@@ -14,6 +14,7 @@ from compgs.config import TrainingConfig
 from compgs.errors import ConfigError, TrainingError
 from compgs.losses import Target
 from compgs.scene.views import View
+from compgs.training.allocation import freed_memory_kept
 from compgs.training.checkpoint import CHECKPOINT_NAME
 from compgs.training.interrupt import held_back
 
@@ -96,6 +97,7 @@ def next_view(order: list[int], views: int, shuffle: np.random.Generator) -> int
     return order.pop()
 
 
+@freed_memory_kept()
 def run_to_end(
     trainer: Trains,
     config: TrainingConfig,
