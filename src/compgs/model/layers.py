@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from compgs.linear import linear
 from compgs.model import residual_mlp
 from compgs.model.residual_mlp import NEGATIVE_SLOPE
 
@@ -78,7 +79,7 @@ class ResidualMLP(nn.Module):
         the residual [residual_dim, width + outputs], four of each block, of the output.
         """
         anchor_entry, entry, bias = self._entry()
-        return torch.addmm(bias, anchor_features, anchor_entry), self._after_entry(entry)
+        return linear(anchor_features, anchor_entry, bias), self._after_entry(entry)
 
     def arrays(self) -> "MLPArrays":
         """A, bias [H + O] of the anchor's part, then R, V1, a1, V2, a2, U of `residual_mlp`: copies, in float32."""
