@@ -51,9 +51,9 @@ def _add_leaky(x, bias, n):
 
 @njit(fastmath=_FASTMATH, cache=True)
 def _add_two(x, y, bias, n):
-    """x[:n] += y + bias, flat."""
+    """x[:n] = (x + bias) + y, flat."""
     for i in range(n):
-        x[i] += y[i] + bias[i]
+        x[i] = x[i] + bias[i] + y[i]
 
 
 @njit(cache=True)
