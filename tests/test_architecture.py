@@ -13,7 +13,7 @@ import compgs
 SOURCE = Path(compgs.__file__).parent
 
 # A part may import itself, and the parts named here.
-BASE = {"compgs", "vector_sums", "errors", "gaussians", "cameras", "config", "outputs", "presets"}
+BASE = {"compgs", "linear", "vector_sums", "errors", "gaussians", "cameras", "config", "outputs", "presets"}
 ALLOWED = {
     "compgs": {
         "errors",
@@ -33,6 +33,7 @@ ALLOWED = {
     "config": {"errors", "presets"},
     "presets": set(),
     "vector_sums": set(),
+    "linear": set(),
     "scene": BASE,
     "render": BASE,
     "model": BASE,

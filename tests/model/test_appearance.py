@@ -7,7 +7,7 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.model import HybridModel, PredictionHeads, Primitives, predict
+from compgs.model import HybridModel, PredictionHeads, Primitives, hybrid_model, predict
 from compgs.model.appearance import ANCHORS, sigmoid
 from compgs.model.primitives import select_anchors
 from compgs.model.residual_mlp import ROWS
@@ -65,6 +65,16 @@ def test_gaussians_agree_with_float64_whatever_the_number_of_primitives(special,
         torch.testing.assert_close(
             getattr(found, name).double(), getattr(expected, name), atol=2e-6, rtol=1e-5
         )
+
+
+def test_parts_of_a_frame_together_are_the_frame(monkeypatch):
+    model = make_model(counts_with(ROWS, 0, 3))
+    whole = model.gaussians(CAMERA)
+    monkeypatch.setattr(hybrid_model, "FRAME_BLOCK", ANCHORS)
+    parts = list(model.parts(CAMERA))
+    assert len(parts) == 4
+    for name in FIELDS:
+        assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(whole, name))
 
 
 def test_an_anchor_at_the_camera_has_finite_colors():

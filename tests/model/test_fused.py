@@ -15,8 +15,10 @@ def inputs(dtype):
     return [x.to(dtype).requires_grad_() for x in made]
 
 
-def prediction(dtype):
-    """Gaussians and gradients of a random function of them by everything that is trained."""
+def prediction(dtype, *, revived=False):
+    """Gaussians and gradients of a random function of them by everything that is trained; `revived`: also of the
+    opacities of what is not drawn.
+    """
     torch.manual_seed(0)
     heads = PredictionHeads(D, G, 16, "paired").to(dtype)
     positions, log_scales, references, residuals = inputs(dtype)
@@ -28,14 +30,18 @@ def prediction(dtype):
     ]
     g = torch.Generator().manual_seed(2)
     weights = [torch.randn(f.shape, generator=g).to(dtype) for f in fields]
-    sum((f * w).sum() for f, w in zip(fields, weights, strict=True)).backward()
+    total = sum((f * w).sum() for f, w in zip(fields, weights, strict=True))
+    if revived:
+        total = total + torch.relu(0.05 - result.opacities).sum()
+    total.backward()
     gradients = [log_scales.grad, references.grad, residuals.grad, *(p.grad for p in heads.parameters())]
     return result.index, [f.detach() for f in fields], gradients
 
 
-def test_fused_prediction_and_its_gradients_agree_with_float64_autograd():
-    index, fields, gradients = prediction(torch.float32)
-    true_index, true_fields, true_gradients = prediction(torch.float64)
+@pytest.mark.parametrize("revived", [False, True])
+def test_fused_prediction_and_its_gradients_agree_with_float64_autograd(revived):
+    index, fields, gradients = prediction(torch.float32, revived=revived)
+    true_index, true_fields, true_gradients = prediction(torch.float64, revived=revived)
     assert torch.equal(index, true_index) and 100 < len(index) < N * K
     for found, truth in zip(fields + gradients, true_fields + true_gradients, strict=True):
         assert (found.double() - truth).abs().max() <= 2e-5 * truth.abs().max()

@@ -13,6 +13,7 @@ from compgs.errors import ConfigError, MissingDependency
 from compgs.gaussians import Gaussians
 from compgs.render import RasterSettings, rasterize, render
 from compgs.render.gsplat_backend import check_settings, load_gsplat
+from compgs.render.rasterize import rasterize_parts
 
 CAMERA = Camera(np.eye(4), 30.0, 30.0, 10.0, 8.0, 20, 16)
 
@@ -52,6 +53,21 @@ def test_a_model_is_rendered_over_its_background_without_gradients():
     assert result.image.shape == (16, 20, 3)
     assert torch.equal(result.image, expected.image.detach())
     assert not result.image.requires_grad
+
+
+def test_gaussians_that_come_in_parts_give_the_image_of_all_of_them():
+    whole = make_gaussians(300)
+    fields = [f.name for f in dataclasses.fields(Gaussians)]
+
+    def part(first: int, last: int) -> Gaussians:
+        return Gaussians(*(getattr(whole, name).detach()[first:last] for name in fields))
+
+    parts = (part(a, b) for a, b in ((0, 0), (0, 1), (1, 200), (200, 300)))
+    found = rasterize_parts(parts, 1000, CAMERA)
+    with torch.no_grad():
+        expected = rasterize(whole, CAMERA)
+    for name in ("image", "transmittance", "means2d", "visible"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
 
 
 def test_settings_replace_the_defaults():

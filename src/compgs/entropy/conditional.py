@@ -17,6 +17,7 @@ from torch import Tensor
 from compgs.entropy.gaussian import BLOCK, FASTMATH, SCALE_LEVELS, element_bits, gaussian_bits
 from compgs.entropy.network import FRACTION_BITS, EntropyNetwork, round_fixed
 from compgs.entropy.quantization import quantize, round_straight_through
+from compgs.linear import transposed_product
 
 Noise = Callable[[Tensor], Tensor]
 
@@ -111,7 +112,7 @@ class _Coded(torch.autograd.Function):
             d_out.numpy(),
         )
         d_context = d_out @ weight if ctx.needs_input_grad[1] else None
-        d_weight = d_out.t() @ context if ctx.needs_input_grad[2] else None
+        d_weight = transposed_product(d_out, context) if ctx.needs_input_grad[2] else None
         d_bias = d_out.sum(0) if ctx.needs_input_grad[3] else None
         return d_y, d_context, d_weight, d_bias, None, None, None, None
 

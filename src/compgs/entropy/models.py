@@ -17,6 +17,7 @@ from compgs.entropy.conditional import code_latents
 from compgs.entropy.factorized import FactorizedDensity
 from compgs.entropy.network import NEGATIVE_SLOPE, OCTAVE, UNIT_SCALE, EntropyNetwork
 from compgs.entropy.quantization import round_straight_through
+from compgs.linear import linear
 
 STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")
 
@@ -35,7 +36,9 @@ class HyperAnalysis(nn.Module):
         self.second = nn.Linear(channels, channels)
 
     def forward(self, y: Tensor) -> Tensor:
-        return self.second(nn.functional.leaky_relu(self.first(y), NEGATIVE_SLOPE))
+        first, second = self.first, self.second
+        hidden = nn.functional.leaky_relu(linear(y, first.weight.t(), first.bias), NEGATIVE_SLOPE)
+        return linear(hidden, second.weight.t(), second.bias)
 
 
 @dataclass(frozen=True)
@@ -98,8 +101,9 @@ class EntropyModel(nn.Module):
         network, step = self.covariance_network, self.covariance_step
         network.weights[-1].mul_(0.1)
         channels = network.channels
-        network.biases[-1][:channels] = log_scales.mean() / (step * network.gain[0])
-        network.biases[-1][channels:] = (log_scales.std().clamp_min(0.1) / step).log2()
+        values = log_scales.double().cpu().numpy()  # numpy's sums do not depend on the number of threads
+        network.biases[-1][:channels] = float(values.mean()) / (step * network.gain[0])
+        network.biases[-1][channels:] = (max(float(values.std(ddof=1)), 0.1) / step).log2()
 
     def starting_residuals(self) -> Tensor:
         """[K * residual_dim] residual embedding that a new anchor starts with, in quantization steps."""

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from compgs.entropy.quantization import quantize_weight, round_straight_through
+from compgs.linear import linear
 
 # A power of two, so that the decoder's leaky ReLU is a shift.
 NEGATIVE_SLOPE = 2.0**-6
@@ -71,7 +72,7 @@ class EntropyNetwork(nn.Module):
         """x [N, inputs] through all layers but the last; then the last one's weight [2 C, in] and bias [2 C]."""
         *hidden, (weight, bias) = self.layers(bits)
         for hidden_weight, hidden_bias in hidden:
-            y = torch.addmm(hidden_bias, x, hidden_weight.t())
+            y = linear(x, hidden_weight.t(), hidden_bias)
             x = nn.functional.leaky_relu(y if bits is None else round_fixed(y), NEGATIVE_SLOPE)
         return x, weight, bias
 

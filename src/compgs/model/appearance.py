@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from compgs.model.residual_mlp import CHUNKS, ROWS, activations
+from compgs.model.residual_mlp import CHUNKS, ROWS, activations, tiled
 
 ANCHORS = 128  # in a block
 
@@ -67,6 +67,7 @@ def predict_appearance(
     V, D, G, H, blocks = len(anchors), references.shape[1], residuals.shape[1], len(U), len(drawn)
     # Several blocks to a task: scratch memory is allocated once per task.
     tasks = min(blocks, 8 * CHUNKS)
+    tiles1, tiles2 = tiled(a1), tiled(a2)
     for t in prange(tasks):
         seen = np.empty((ANCHORS, D + 4), np.float32)
         shared = np.empty((ANCHORS, H + 4), np.float32)
@@ -93,7 +94,7 @@ def predict_appearance(
                     row[i] = v - v0
                     for c in range(G):
                         own[i, c] = residuals[p, c]
-                activations(own[:n], row[:n], shared, R, V1, a1, V2, a2, first[:n], x, h)
+                activations(own[:n], row[:n], shared, R, V1, tiles1, V2, tiles2, first[:n], x, h)
                 out = appearance[place : place + n]
                 np.dot(x[len(V1), :n], U, out)
                 count += activate(out, first, H, cutoff)

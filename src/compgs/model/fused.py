@@ -1,11 +1,16 @@
-"""What lies between the prediction networks and the Gaussians, on the CPU in one pass each way.
+"""Paired prediction networks and all around them on the CPU: from anchors and residuals to the Gaussians of a view.
 
-The same as the plain torch of `prediction.py`, which the tests compare it with. Written out in torch these few
-operations cost as much as the networks: a dozen passes over all primitives, and gradients of gathers that are summed by
-one thread. Indices ascend, so that each anchor's gradient is summed by one thread, in order: the result does not
+    all P primitives ──► appearance ──► opacity ──► the M that are drawn ──► geometry ──► means, scales, quaternions
+                                                            └──► colors
+
+The same as the plain torch of `prediction.py`, which the tests compare it with. Written out in torch the few operations
+around the networks cost as much as the networks: a dozen passes over all primitives, copies of what is drawn, and
+gradients of gathers that are summed by one thread. What is not drawn has no gradient, so the backward pass looks at the
+drawn ones alone. Indices ascend, so that each anchor's gradient is summed by one thread, in order: the result does not
 depend on the number of threads.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,154 +18,201 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from compgs.model.residual_mlp import CHUNKS, chunk_bounds
+from compgs.model import residual_mlp
+from compgs.model.appearance import sigmoid
+from compgs.model.layers import ALL_ROWS, mlp_gradients, weight_arrays
+from compgs.model.residual_mlp import CHUNKS, ROWS, chunk_bounds
 
 _FASTMATH = {"contract", "nsz", "arcp"}
 _ONE = np.float32(1)
 
 
-class SelectVisible(torch.autograd.Function):
-    """raw [P, 4], residuals [P, G] -> of the primitives that are drawn: opacities [M], colors [M, 3], residuals [M, G];
-    their index [M] (no gradient), and opacities [P] of all.
+class PairedPrediction(torch.autograd.Function):
+    """The Gaussians that are drawn: means, scales [M, 3], quaternions [M, 4], opacities [M], colors [M, 3]; their index
+    [M] (no gradient); and opacities [P] of all.
     """
 
     @staticmethod
-    def forward(ctx: Any, raw: Tensor, residuals: Tensor, cutoff: float) -> tuple[Tensor, ...]:
-        raw, residuals = raw.contiguous(), residuals.contiguous()
-        all_opacities = torch.tanh(raw.detach()[:, 0])
-        index = torch.nonzero(all_opacities > cutoff).view(-1)
-        m = len(index)
-        opacities, colors = raw.new_empty(m), raw.new_empty(m, 3)
-        chosen = residuals.new_empty(m, residuals.shape[1])
-        _select(
-            raw.detach().numpy(),
-            residuals.detach().numpy(),
-            all_opacities.numpy(),
-            index.numpy(),
-            opacities.numpy(),
-            colors.numpy(),
-            chosen.numpy(),
-        )
-        ctx.save_for_backward(index, opacities, colors, all_opacities)
-        ctx.shapes = raw.shape, residuals.shape
-        ctx.mark_non_differentiable(index)
-        ctx.set_materialize_grads(False)
-        return opacities, colors, chosen, index, all_opacities
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        index, opacities, colors, all_opacities = ctx.saved_tensors
-        d_raw, d_residuals = (opacities.new_zeros(shape) for shape in ctx.shapes)
-        d_opacities, d_colors, d_chosen = (
-            shape_of.new_zeros(shape_of.shape) if g is None else g.contiguous()
-            for g, shape_of in zip(
-                grads, (opacities, colors, opacities.new_empty(len(index), ctx.shapes[1][1])), strict=False
-            )
-        )
-        _select_gradient(
-            index.numpy(),
-            opacities.detach().numpy(),
-            colors.detach().numpy(),
-            d_opacities.numpy(),
-            d_colors.numpy(),
-            d_chosen.numpy(),
-            d_raw.numpy(),
-            d_residuals.numpy(),
-        )
-        if grads[4] is not None:
-            d_raw[:, 0] += grads[4] * (1.0 - all_opacities.detach() ** 2)
-        return d_raw, d_residuals, None
-
-
-class AffineTransform(torch.autograd.Function):
-    """raw [M, 10], positions [A, 3], log_scales [A, 6], index [M] ascending -> means, scales [M, 3], quaternions."""
-
-    @staticmethod
     def forward(
-        ctx: Any, raw: Tensor, positions: Tensor, log_scales: Tensor, index: Tensor, voxel_size: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        raw, index = raw.contiguous(), index.contiguous()
+        ctx: Any,
+        seen: Tensor,  # [A, H + 4] the anchors' part of the appearance network (`ResidualMLP.begin`)
+        shared: Tensor,  # [A, H + 10] and of the geometry network
+        residuals: Tensor,  # [P, G]
+        log_scales: Tensor,  # [A, 6]
+        positions: Tensor,  # [A, 3] world units; without gradient
+        anchor_index: Tensor,  # [P] int64, ascending
+        voxel_size: float,  # world units
+        cutoff: float,  # opacity that a primitive must exceed to be drawn
+        *weights: Tensor,  # of the appearance network, then as many of the geometry network
+    ) -> tuple[Tensor, ...]:
+        seen, shared, residuals = seen.contiguous(), shared.contiguous(), residuals.contiguous()
+        appearance, geometry = _halves(weights)
+        raw = residuals.new_empty(len(residuals), 4)
+        own, index = residuals.detach().numpy(), anchor_index.contiguous().numpy()
+        residual_mlp.forward(
+            own, ALL_ROWS, index, seen.detach().numpy(), *weight_arrays(appearance), raw.numpy()
+        )
+        all_opacities = torch.tanh(raw[:, 0])
+        drawn = torch.nonzero(all_opacities > cutoff).view(-1)
+        anchor = anchor_index.index_select(0, drawn)
+        m = len(drawn)
+        raw_geometry = raw.new_empty(m, 10)
+        residual_mlp.forward(
+            own,
+            _rows(drawn, residuals),
+            anchor.numpy(),
+            shared.detach().numpy(),
+            *weight_arrays(geometry),
+            raw_geometry.numpy(),
+        )
         reach = log_scales.detach().exp() * voxel_size
-        m = len(raw)
         means, scales, quaternions = raw.new_empty(m, 3), raw.new_empty(m, 3), raw.new_empty(m, 4)
-        _affine(
-            raw.detach().numpy(),
+        opacities, colors, moves = raw.new_empty(m), raw.new_empty(m, 3), raw.new_empty(m, 3)
+        _finish(
+            raw.numpy(),
+            all_opacities.numpy(),
+            drawn.numpy(),
+            raw_geometry.numpy(),
             positions.detach().contiguous().numpy(),
             reach.numpy(),
-            index.numpy(),
+            anchor.numpy(),
             means.numpy(),
             scales.numpy(),
             quaternions.numpy(),
+            opacities.numpy(),
+            colors.numpy(),
+            moves.numpy(),
         )
-        ctx.save_for_backward(raw, reach, index, scales)
-        return means, scales, quaternions
+        ctx.save_for_backward(
+            seen, shared, residuals, anchor_index, drawn, anchor, all_opacities, opacities, colors,
+            moves, reach, scales, *weights,
+        )  # fmt: skip
+        ctx.mark_non_differentiable(drawn)
+        ctx.set_materialize_grads(False)
+        return means, scales, quaternions, opacities, colors, drawn, all_opacities
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        raw, reach, index, scales = ctx.saved_tensors
-        d_raw, d_log_scales = torch.empty_like(raw), torch.zeros_like(reach)
-        _affine_gradient(
-            raw.detach().numpy(),
-            reach.numpy(),
-            index.numpy(),
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        (
+            seen, shared, residuals, anchor_index, drawn, anchor, all_opacities, opacities, colors,
+            moves, reach, scales, *weights,
+        ) = ctx.saved_tensors  # fmt: skip
+        appearance, geometry = _halves(weights)
+        m = len(drawn)
+        shapes = (m, 3), (m, 3), (m, 4), (m,), (m, 3)
+        d_means, d_scales, d_quaternions, d_opacities, d_colors = (
+            np.zeros(shape, np.float32) if g is None else g.contiguous().numpy()
+            for g, shape in zip(grads, shapes, strict=False)
+        )
+        d_appearance, d_geometry = np.empty((m, 4), np.float32), np.empty((m, 10), np.float32)
+        d_log_scales = torch.zeros_like(reach)
+        _finish_gradient(
+            opacities.detach().numpy(),
+            colors.detach().numpy(),
+            moves.numpy(),
             scales.detach().numpy(),
-            grads[0].contiguous().numpy(),
-            grads[1].contiguous().numpy(),
-            grads[2].contiguous().numpy(),
-            chunk_bounds(index.numpy(), CHUNKS),
-            d_raw.numpy(),
+            reach.numpy(),
+            anchor.numpy(),
+            d_means,
+            d_scales,
+            d_quaternions,
+            d_opacities,
+            d_colors,
+            chunk_bounds(anchor.numpy(), CHUNKS),
+            d_appearance,
+            d_geometry,
             d_log_scales.numpy(),
         )
-        return d_raw, None, d_log_scales, None, None
+        want_seen, want_shared, want_residuals, *_ = ctx.needs_input_grad
+        want_weights = ctx.needs_input_grad[8:]
+        d_residuals = residuals.new_zeros(len(residuals) if want_residuals else 0, residuals.shape[1])
+        own, rows = residuals.detach().numpy(), _rows(drawn, residuals)
+        d_shared, d_of_geometry = mlp_gradients(
+            (own, rows, anchor.numpy(), shared.detach().numpy()),
+            geometry,
+            d_geometry,
+            d_residuals.numpy(),
+            want_shared=want_shared,
+            want_weights=any(want_weights[len(appearance) :]),
+        )
+        index = anchor.numpy()
+        if grads[6] is not None:  # what is not drawn is pulled at as well
+            d_all = np.zeros((len(residuals), 4), np.float32)
+            d_all[drawn.numpy()] = d_appearance
+            d_all[:, 0] += (grads[6] * (1.0 - all_opacities.detach() ** 2)).numpy()
+            rows, index, d_appearance = ALL_ROWS, anchor_index.contiguous().numpy(), d_all
+        d_seen, d_of_appearance = mlp_gradients(
+            (own, rows, index, seen.detach().numpy()),
+            appearance,
+            d_appearance,
+            d_residuals.numpy(),
+            want_shared=want_seen,
+            want_weights=any(want_weights[: len(appearance)]),
+        )
+        by_residuals = d_residuals if want_residuals else None
+        return (
+            d_seen, d_shared, by_residuals, d_log_scales, None, None, None, None,
+            *d_of_appearance, *d_of_geometry,
+        )  # fmt: skip
+
+
+def _halves(weights: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    """The weights of the appearance and of the geometry network."""
+    return weights[: len(weights) // 2], weights[len(weights) // 2 :]
+
+
+def _rows(drawn: Tensor, residuals: Tensor) -> np.ndarray:
+    """`rows` of `residual_mlp`: where all are drawn nothing need be gathered."""
+    return ALL_ROWS if len(drawn) == len(residuals) else drawn.numpy()
 
 
 @njit(parallel=True, fastmath=_FASTMATH, cache=True)
-def _select(raw, residuals, all_opacities, index, opacities, colors, chosen):
-    for j in prange(len(index)):
-        p = index[j]
-        opacities[j] = all_opacities[p]
-        for c in range(3):
-            colors[j, c] = _ONE / (_ONE + np.exp(-raw[p, 1 + c]))
-        for c in range(residuals.shape[1]):
-            chosen[j, c] = residuals[p, c]
+def _finish(
+    raw, all_opacities, drawn, raw_geometry, positions, reach, anchor,
+    means, scales, quaternions, opacities, colors, moves,
+):  # fmt: skip
+    m = len(drawn)
+    for block in prange((m + ROWS - 1) // ROWS):
+        first, last = block * ROWS, min(m, (block + 1) * ROWS)
+        # Side by side, so that sigmoids are computed in vector registers.
+        bounded = np.zeros((ROWS, 6), np.float32)
+        for j in range(first, last):
+            for c in range(3):
+                bounded[j - first, c] = raw[drawn[j], 1 + c]
+                bounded[j - first, 3 + c] = raw_geometry[j, 3 + c]
+        flat = bounded.ravel()
+        for i in range(6 * ROWS):
+            flat[i] = sigmoid(flat[i])
+        for j in range(first, last):
+            a = anchor[j]
+            opacities[j] = all_opacities[drawn[j]]
+            for c in range(3):
+                colors[j, c] = bounded[j - first, c]
+                moves[j, c] = raw_geometry[j, c]
+                means[j, c] = positions[a, c] + raw_geometry[j, c] * reach[a, c]
+                scales[j, c] = reach[a, 3 + c] * bounded[j - first, 3 + c]
+            quaternions[j, 0] = raw_geometry[j, 6] + _ONE
+            for c in range(1, 4):
+                quaternions[j, c] = raw_geometry[j, 6 + c]
 
 
 @njit(parallel=True, fastmath=_FASTMATH, cache=True)
-def _select_gradient(index, opacities, colors, d_opacities, d_colors, d_chosen, d_raw, d_residuals):
-    for j in prange(len(index)):
-        p = index[j]
-        d_raw[p, 0] = d_opacities[j] * (_ONE - opacities[j] * opacities[j])
-        for c in range(3):
-            d_raw[p, 1 + c] = d_colors[j, c] * colors[j, c] * (_ONE - colors[j, c])
-        for c in range(d_residuals.shape[1]):
-            d_residuals[p, c] = d_chosen[j, c]
-
-
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
-def _affine(raw, positions, reach, index, means, scales, quaternions):
-    for j in prange(len(index)):
-        a = index[j]
-        for c in range(3):
-            means[j, c] = positions[a, c] + raw[j, c] * reach[a, c]
-            scales[j, c] = reach[a, 3 + c] / (_ONE + np.exp(-raw[j, 3 + c]))
-        quaternions[j, 0] = raw[j, 6] + _ONE
-        for c in range(1, 4):
-            quaternions[j, c] = raw[j, 6 + c]
-
-
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
-def _affine_gradient(
-    raw, reach, index, scales, d_means, d_scales, d_quaternions, bounds, d_raw, d_log_scales
-):
+def _finish_gradient(
+    opacities, colors, moves, scales, reach, anchor,
+    d_means, d_scales, d_quaternions, d_opacities, d_colors,
+    bounds, d_appearance, d_geometry, d_log_scales,
+):  # fmt: skip
     for chunk in prange(len(bounds) - 1):
         for j in range(bounds[chunk], bounds[chunk + 1]):
-            a = index[j]
+            a = anchor[j]
+            d_appearance[j, 0] = d_opacities[j] * (_ONE - opacities[j] * opacities[j])
             for c in range(3):
+                d_appearance[j, 1 + c] = d_colors[j, c] * colors[j, c] * (_ONE - colors[j, c])
                 moved = d_means[j, c] * reach[a, c]
-                d_raw[j, c] = moved
-                d_log_scales[a, c] += moved * raw[j, c]
+                d_geometry[j, c] = moved
+                d_log_scales[a, c] += moved * moves[j, c]
                 grown = d_scales[j, c] * scales[j, c]
-                d_raw[j, 3 + c] = grown * (_ONE - scales[j, c] / reach[a, 3 + c])
+                d_geometry[j, 3 + c] = grown * (_ONE - scales[j, c] / reach[a, 3 + c])
                 d_log_scales[a, 3 + c] += grown
             for c in range(4):
-                d_raw[j, 6 + c] = d_quaternions[j, c]
+                d_geometry[j, 6 + c] = d_quaternions[j, c]

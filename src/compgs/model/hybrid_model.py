@@ -27,6 +27,7 @@ from compgs.model.primitives import Primitives
 CUTOFF_SIGMAS = 3.34
 # Anchors are worked on in blocks, so that memory stays near the size of the result.
 BLOCK = 1 << 14
+FRAME_BLOCK = 1 << 12  # whole blocks of `appearance`, so that dividing a frame changes nothing
 GPU_BLOCK = 1 << 18  # a GPU is not busy with fewer
 
 
@@ -107,6 +108,16 @@ class HybridModel:
         if self._fused:
             return self._fused_gaussians(*self._seen_from(camera, visible))
         return self.drawn(camera, visible)[0]
+
+    @torch.no_grad()
+    def parts(self, camera: Camera, visible: Tensor | None = None) -> Iterator[Gaussians]:
+        """The same Gaussians, on the CPU those of FRAME_BLOCK anchors at a time; one part at least."""
+        if not self._fused:
+            yield self.drawn(camera, visible)[0]
+            return
+        chosen, center = self._seen_from(camera, visible)
+        for anchors in chosen.split(FRAME_BLOCK):
+            yield self._fused_gaussians(anchors, center)
 
     @torch.no_grad()
     def drawn(self, camera: Camera, visible: Tensor | None = None) -> tuple[Gaussians, Tensor]:

@@ -9,12 +9,14 @@ those of `g`.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from compgs.linear import linear
 from compgs.model import residual_mlp
 from compgs.model.residual_mlp import NEGATIVE_SLOPE
 
@@ -62,20 +64,27 @@ class ResidualMLP(nn.Module):
         residuals: Tensor,  # [M, residual_dim]
         anchor_index: Tensor,  # [M] int64, ascending: row of anchor_features of each coupled primitive
     ) -> Tensor:  # [M, outputs]
-        anchor_entry, entry, bias = self._entry()
-        shared = torch.addmm(bias, anchor_features, anchor_entry)
+        shared, weights = self.begin(anchor_features)
+        entry = weights[0]
         if shared.device.type == "cpu" and shared.dtype == residuals.dtype == torch.float32:
-            return _FusedMLP.apply(shared, residuals, anchor_index, *self._after_entry(entry))
+            return _FusedMLP.apply(shared, residuals, anchor_index, *weights)
         first = torch.addmm(shared.index_select(0, anchor_index), residuals, entry)  # float16 under autocast
         x = nn.functional.leaky_relu(first[:, : self.width], NEGATIVE_SLOPE)
         for block in self.blocks:
             x = block(x)
         return torch.addmm(first[:, self.width :], x, self.output_weight)
 
+    def begin(self, anchor_features: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """The anchors' part of the first layer and of the skip, biases included [A, width + outputs]; other weights: of
+        the residual [residual_dim, width + outputs], four of each block, of the output.
+        """
+        anchor_entry, entry, bias = self._entry()
+        return linear(anchor_features, anchor_entry, bias), self._after_entry(entry)
+
     def arrays(self) -> "MLPArrays":
         """A, bias [H + O] of the anchor's part, then R, V1, a1, V2, a2, U of `residual_mlp`: copies, in float32."""
         anchor_entry, entry, bias = (t.detach() for t in self._entry())
-        return anchor_entry.numpy(), bias.numpy(), *_arrays(tuple(self._after_entry(entry)))
+        return anchor_entry.numpy(), bias.numpy(), *weight_arrays(self._after_entry(entry))
 
     def _entry(self) -> tuple[Tensor, Tensor, Tensor]:
         """First layer and skip side by side: of the anchor, of the residual [inputs, width + outputs]; bias."""
@@ -84,16 +93,16 @@ class ResidualMLP(nn.Module):
         return entry[: self.anchor_dim], entry[self.anchor_dim :], bias
 
     def _after_entry(self, entry: Tensor) -> list[Tensor]:
-        """Weights of `_FusedMLP`."""
         return [entry, *(p for block in self.blocks for p in block.parameters()), self.output_weight]
 
 
 _A = np.ndarray
 MLPArrays = tuple[_A, _A, _A, _A, _A, _A, _A, _A]
+ALL_ROWS = np.empty(0, np.int64)
 
 
-def _arrays(weights: tuple[Tensor, ...]) -> tuple[_A, _A, _A, _A, _A, _A]:
-    """R, V1, a1, V2, a2, U of `residual_mlp` from the list of weights of `_FusedMLP`."""
+def weight_arrays(weights: Sequence[Tensor]) -> tuple[_A, _A, _A, _A, _A, _A]:
+    """R, V1, a1, V2, a2, U of `residual_mlp` from the weights of `ResidualMLP.begin`."""
     values = [w.detach().contiguous().numpy() for w in weights]
     width = len(values[-1])
     blocks = (len(values) - 2) // 4
@@ -106,15 +115,38 @@ def _arrays(weights: tuple[Tensor, ...]) -> tuple[_A, _A, _A, _A, _A, _A]:
     return values[0], V1, a1, V2, a2, values[-1]
 
 
+def mlp_gradients(
+    inputs: tuple[_A, _A, _A, _A],  # residuals, rows, index, shared of `residual_mlp.forward`
+    weights: Sequence[Tensor],  # of `ResidualMLP.begin`
+    d_out: _A,  # [M, outputs]
+    d_residuals: _A,  # added to; [0, residual_dim]: not wanted
+    *,
+    want_shared: bool,
+    want_weights: bool,
+) -> tuple[Tensor | None, list[Tensor | None]]:
+    """Gradients by the anchors' part and by the weights, where wanted."""
+    index, shared = inputs[2], inputs[3]
+    d_shared = np.zeros((len(shared) if want_shared else 0, shared.shape[1]), np.float32)
+    sizes = [w.numel() for w in weights]
+    parts = np.zeros((residual_mlp.CHUNKS, sum(sizes) if want_weights else 0), np.float32)
+    bounds = residual_mlp.chunk_bounds(index, residual_mlp.CHUNKS)
+    residual_mlp.backward(*inputs, *weight_arrays(weights), d_out, bounds, d_residuals, d_shared, parts)
+    d_weights: list[Tensor | None] = [None] * len(weights)
+    if want_weights:
+        pieces = torch.from_numpy(parts.sum(0)).split(sizes)
+        d_weights = [g.view(w.shape) for g, w in zip(pieces, weights, strict=True)]
+    return torch.from_numpy(d_shared) if want_shared else None, d_weights
+
+
 class _FusedMLP(torch.autograd.Function):
-    """Everything after the anchor's part, on the CPU in float32. Weights: entry, four per block, output."""
+    """Everything after the anchor's part, on the CPU in float32; see `ResidualMLP.begin`."""
 
     @staticmethod
     def forward(ctx: Any, shared: Tensor, residuals: Tensor, index: Tensor, *weights: Tensor) -> Tensor:
         shared, residuals, index = shared.contiguous(), residuals.contiguous(), index.contiguous()
         out = residuals.new_empty(len(residuals), weights[-1].shape[1])
-        inputs = residuals.detach().numpy(), index.numpy(), shared.detach().numpy()
-        residual_mlp.forward(*inputs, *_arrays(weights), out.numpy())
+        inputs = residuals.detach().numpy(), ALL_ROWS, index.numpy(), shared.detach().numpy()
+        residual_mlp.forward(*inputs, *weight_arrays(weights), out.numpy())
         ctx.save_for_backward(shared, residuals, index, *weights)
         return out
 
@@ -122,18 +154,13 @@ class _FusedMLP(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         shared, residuals, index, *weights = ctx.saved_tensors
         want_shared, want_residuals, _, *want_weights = ctx.needs_input_grad
-        # Empty means not wanted.
-        d_shared = shared.new_zeros(len(shared) if want_shared else 0, shared.shape[1])
-        d_residuals = residuals.new_empty(len(residuals) if want_residuals else 0, residuals.shape[1])
-        size = sum(w.numel() for w in weights) if any(want_weights) else 0
-        parts = np.zeros((residual_mlp.CHUNKS, size), np.float32)
-        inputs = residuals.detach().numpy(), index.numpy(), shared.detach().numpy()
-        bounds = residual_mlp.chunk_bounds(inputs[1], residual_mlp.CHUNKS)
-        outputs = d_residuals.numpy(), d_shared.numpy(), parts
-        d_out = grads[0].contiguous().numpy()
-        residual_mlp.backward(*inputs, *_arrays(tuple(weights)), d_out, bounds, *outputs)
-        d_weights: list[Tensor | None] = [None] * len(weights)
-        if size:
-            pieces = torch.from_numpy(parts.sum(0)).split([w.numel() for w in weights])
-            d_weights = [g.view(w.shape) for g, w in zip(pieces, weights, strict=True)]
-        return d_shared if want_shared else None, d_residuals if want_residuals else None, None, *d_weights
+        d_residuals = residuals.new_zeros(len(residuals) if want_residuals else 0, residuals.shape[1])
+        d_shared, d_weights = mlp_gradients(
+            (residuals.detach().numpy(), ALL_ROWS, index.numpy(), shared.detach().numpy()),
+            weights,
+            grads[0].contiguous().numpy(),
+            d_residuals.numpy(),
+            want_shared=want_shared,
+            want_weights=any(want_weights),
+        )
+        return d_shared, d_residuals if want_residuals else None, None, *d_weights

@@ -13,13 +13,14 @@ import contextlib
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.model.fused import AffineTransform, SelectVisible
+from compgs.model.fused import PairedPrediction
 from compgs.model.layers import ResidualMLP
 from compgs.model.primitives import Primitives
 
@@ -55,8 +56,8 @@ class PredictionHeads(nn.Module):
         network.skip_weight[:3, first : first + 3] = torch.eye(3)
         network.output_bias[first : first + 3] = mean
 
-    def forward(self, kind: str, *args: Tensor) -> Tensor:
-        """One of `predict_opacity`, `predict_color`, ... by name, so that torch.func.functional_call reaches them."""
+    def forward(self, kind: str, *args: Any) -> Any:
+        """`predict_appearance`, `predict_color` and so on, by name, so that torch.func.functional_call reaches them."""
         return getattr(self, f"predict_{kind}")(*args)
 
     def predict_appearance(self, anchors: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
@@ -73,6 +74,16 @@ class PredictionHeads(nn.Module):
             return self.geometry(anchors, residuals, index)
         translation = self.translation(anchors, residuals, index)
         return torch.cat([translation, self.covariance(anchors, residuals, index)], 1)
+
+    def predict_drawn(self, seen: Tensor, primitives: Primitives) -> tuple[Tensor, ...]:
+        """What `PairedPrediction` returns (paired only, on the CPU in float32). seen: [N, reference_dim + VIEW_DIM]"""
+        p = primitives
+        appearance, appearance_weights = self.appearance.begin(seen)
+        geometry, geometry_weights = self.geometry.begin(p.references)
+        return PairedPrediction.apply(
+            appearance, geometry, p.residuals, p.log_scales, p.positions, p.anchor_index, p.voxel_size,
+            OPACITY_CUTOFF, *appearance_weights, *geometry_weights,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -146,28 +157,23 @@ def predict(
     not be waited for to learn how many there are. `appearance_dtype`: of the networks of opacity and color.
     """
 
+    def heads_with_weights(*args: Any) -> Any:
+        return heads(*args) if weights is None else torch.func.functional_call(heads, weights, args)
+
     def call(kind: str, anchors: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
         dtype = torch.float32 if kind == "geometry" else appearance_dtype
         with appearance_precision(residuals.device, dtype):
-            if weights is None:
-                raw = heads(kind, anchors, residuals, index)
-            else:
-                raw = torch.func.functional_call(heads, weights, (kind, anchors, residuals, index))
-        return raw.to(residuals.dtype)
+            return heads_with_weights(kind, anchors, residuals, index).to(residuals.dtype)
 
     view = view_embedding(primitives.positions, camera_center, distance_unit)
     seen = torch.cat([primitives.references, view], 1)
+    plain = seen.device.type == "cpu" and seen.dtype == appearance_dtype == torch.float32
+    if compact and plain and heads.layout == "paired":
+        means, scales, quaternions, shown, colors, index, opacities = heads_with_weights(
+            "drawn", seen, primitives
+        )
+        return Prediction(Gaussians(means, quaternions, scales, shown, colors), index, opacities)
     raw = call("appearance", seen, primitives.residuals, primitives.anchor_index)
-    if compact and heads.layout == "paired" and raw.device.type == "cpu" and raw.dtype == torch.float32:
-        drawn, colors, residuals, index, opacities = SelectVisible.apply(
-            raw, primitives.residuals, OPACITY_CUTOFF
-        )
-        anchor = primitives.anchor_index[index]
-        geometry = call("geometry", primitives.references, residuals, anchor)
-        means, scales, quaternions = AffineTransform.apply(
-            geometry, primitives.positions, primitives.log_scales, anchor, primitives.voxel_size
-        )
-        return Prediction(Gaussians(means, quaternions, scales, drawn, colors), index, opacities)
     opacities = torch.tanh(raw[:, 0])
     if not compact:
         return _predict_all(heads, primitives, call, seen, raw, opacities)

@@ -28,13 +28,6 @@ _FASTMATH = {"contract", "nsz", "arcp"}
 
 
 @njit(fastmath=_FASTMATH, cache=True)
-def _leaky(x, n):
-    """x[:n] = max(x, slope x), x flat."""
-    for i in range(n):
-        x[i] = max(x[i], _SLOPE * x[i])
-
-
-@njit(fastmath=_FASTMATH, cache=True)
 def _leaky_gradient(d, x, n):
     """d[:n] *= the slope where the activation x was negative; leaky keeps the sign, so its output tells."""
     for i in range(n):
@@ -49,44 +42,72 @@ def _add(x, y, n):
 
 
 @njit(fastmath=_FASTMATH, cache=True)
-def _add_bias(x, bias, rows):
-    for i in range(rows):
-        for j in range(bias.shape[0]):
-            x[i, j] += bias[j]
+def _add_leaky(x, bias, n):
+    """x[:n] = leaky(x + bias), flat."""
+    for i in range(n):
+        y = x[i] + bias[i]
+        x[i] = max(y, _SLOPE * y)
 
 
 @njit(fastmath=_FASTMATH, cache=True)
-def _add_rows(total, d, rows):
-    """total[j] += sum over rows of d[:, j]."""
-    for i in range(rows):
-        for j in range(total.shape[0]):
-            total[j] += d[i, j]
+def _add_two(x, y, bias, n):
+    """x[:n] = (x + bias) + y, flat."""
+    for i in range(n):
+        x[i] = x[i] + bias[i] + y[i]
+
+
+@njit(cache=True)
+def tiled(biases):
+    """[blocks, H] -> [blocks, ROWS * H]: a bias for each number of a group, so that adding it is one flat loop."""
+    H = biases.shape[1]
+    tiles = np.empty((len(biases), ROWS * H), np.float32)
+    for b in range(len(biases)):
+        for i in range(ROWS):
+            tiles[b, i * H : (i + 1) * H] = biases[b]
+    return tiles
 
 
 @njit(fastmath=_FASTMATH, cache=True)
-def activations(residuals, index, shared, R, V1, a1, V2, a2, first, x, h):
-    """One group: fills first [n, H + O], x [blocks + 1, ROWS, H] and h [blocks, ROWS, H]."""
+def _add_shared(first, shared, index, x):
+    """first[i] += shared[index[i]]; x [n, H] = leaky(its first columns)."""
+    H, F = x.shape[1], first.shape[1]
+    for i in range(len(index)):
+        anchor = index[i]
+        for j in range(H):
+            y = first[i, j] + shared[anchor, j]
+            x[i, j] = max(y, _SLOPE * y)
+        for j in range(H, F):
+            first[i, j] += shared[anchor, j]
+
+
+@njit(fastmath=_FASTMATH, cache=True)
+def activations(residuals, index, shared, R, V1, a1_tiles, V2, a2_tiles, first, x, h):
+    """One group: fills the last O columns of first [n, H + O], x [blocks + 1, ROWS, H] and h [blocks, ROWS, H]."""
     n, H = residuals.shape[0], V1.shape[2]
     np.dot(residuals, R, first)
-    for i in range(n):
-        anchor = index[i]
-        for j in range(first.shape[1]):
-            first[i, j] += shared[anchor, j]
-    for i in range(n):
-        for j in range(H):
-            x[0, i, j] = max(first[i, j], _SLOPE * first[i, j])
+    _add_shared(first, shared, index, x[0])
     for b in range(V1.shape[0]):
         np.dot(x[b, :n], V1[b], h[b, :n])
-        _add_bias(h[b], a1[b], n)
-        _leaky(h[b].ravel(), n * H)
+        _add_leaky(h[b].ravel(), a1_tiles[b], n * H)
         np.dot(h[b, :n], V2[b], x[b + 1, :n])
-        _add_bias(x[b + 1], a2[b], n)
-        _add(x[b + 1].ravel(), x[b].ravel(), n * H)
+        _add_two(x[b + 1].ravel(), x[b].ravel(), a2_tiles[b], n * H)
+
+
+@njit(inline="always")
+def _chosen(residuals, rows, p, q, scratch):
+    """Residuals of a group: a part of the array, or gathered."""
+    if len(rows) == 0:
+        return residuals[p:q]
+    for i in range(q - p):
+        for c in range(residuals.shape[1]):
+            scratch[i, c] = residuals[rows[p + i], c]
+    return scratch[: q - p]
 
 
 @njit(parallel=True, cache=True)
 def forward(
-    residuals,  # [M, G] float32
+    residuals,  # [P, G] float32
+    rows,  # [M] int64, ascending: those that are computed; [0]: all, M = P
     index,  # [M] int64: row of shared, ascending
     shared,  # [A, H + O] float32: the anchor's part of the first layer and of the skip, biases included
     R,  # [G, H + O]
@@ -97,18 +118,21 @@ def forward(
     U,  # [H, O]
     out,  # [M, O], written
 ):
-    M, H, O, blocks = len(residuals), U.shape[0], U.shape[1], len(V1)
+    M, G, H, O, blocks = len(index), len(R), U.shape[0], U.shape[1], len(V1)
     groups = (M + ROWS - 1) // ROWS
     # Several groups to a task: scratch memory is allocated once per task.
     tasks = min(groups, 8 * CHUNKS)
+    tiles1, tiles2 = tiled(a1), tiled(a2)
     for t in prange(tasks):
+        own = np.empty((ROWS, G), np.float32)
         first = np.empty((ROWS, H + O), np.float32)
         x = np.empty((blocks + 1, ROWS, H), np.float32)
         h = np.empty((blocks, ROWS, H), np.float32)
         for g in range(groups * t // tasks, groups * (t + 1) // tasks):
             p, q = g * ROWS, min(M, (g + 1) * ROWS)
             n = q - p
-            activations(residuals[p:q], index[p:q], shared, R, V1, a1, V2, a2, first[:n], x, h)
+            taken = _chosen(residuals, rows, p, q, own)
+            activations(taken, index[p:q], shared, R, V1, tiles1, V2, tiles2, first[:n], x, h)
             np.dot(x[blocks, :n], U, out[p:q])
             for i in range(n):
                 for j in range(O):
@@ -128,9 +152,27 @@ def chunk_bounds(index, chunks):
     return bounds
 
 
+@njit(fastmath=_FASTMATH, cache=True)
+def _first_gradient(first, dx, x, d, index, d_shared):
+    """first [n, H + O] becomes its own gradient: from dx, of x = leaky(first[:, :H]), and d, of first[:, H:]. Each row
+    is added to its anchor's in d_shared.
+    """
+    H, O = x.shape[1], d.shape[1]
+    for i in range(len(d)):
+        anchor = index[i]
+        for j in range(H):
+            first[i, j] = dx[i, j] if x[i, j] > np.float32(0) else _SLOPE * dx[i, j]
+        for j in range(O):
+            first[i, H + j] = d[i, j]
+        if len(d_shared) > 0:
+            for j in range(H + O):
+                d_shared[anchor, j] += first[i, j]
+
+
 @njit(parallel=True, cache=True)
 def backward(
     residuals,
+    rows,
     index,
     shared,
     R,
@@ -141,37 +183,38 @@ def backward(
     U,
     d_out,  # [M, O]
     bounds,  # [chunks + 1] from chunk_bounds
-    d_residuals,  # [M, G] written; [0, G] if not wanted
-    d_shared,  # [A, H + O] zero, written; [0, H + O] if not wanted
+    d_residuals,  # [P, G] added to; [0, G] if not wanted
+    d_shared,  # [A, H + O] added to; [0, H + O] if not wanted
     d_weights,  # [chunks, size] zero, written: R, per block V1, a1, V2, a2, then U; [chunks, 0] if not wanted
 ):
     G, H, O, blocks = len(R), U.shape[0], U.shape[1], len(V1)
     F = H + O
-    want_residuals, want_shared, want_weights = (
-        len(d_residuals) > 0,
-        len(d_shared) > 0,
-        d_weights.shape[1] > 0,
-    )
+    want_residuals, want_weights = len(d_residuals) > 0, d_weights.shape[1] > 0
     # BLAS takes a transposed right factor at half the rate.
     R_t, U_t = np.ascontiguousarray(R.T), np.ascontiguousarray(U.T)
     V1_t, V2_t = np.empty_like(V1), np.empty_like(V2)
     for b in range(blocks):
         V1_t[b], V2_t[b] = V1[b].T, V2[b].T
+    tiles1, tiles2 = tiled(a1), tiled(a2)
     for c in prange(len(bounds) - 1):
+        own = np.empty((ROWS, G), np.float32)
         first = np.empty((ROWS, F), np.float32)
         x = np.empty((blocks + 1, ROWS, H), np.float32)
         h = np.empty((blocks, ROWS, H), np.float32)
         dx = np.empty((ROWS, H), np.float32)
         dh = np.empty((ROWS, H), np.float32)
         part = np.empty((ROWS, H), np.float32)
+        part_own = np.empty((ROWS, G), np.float32)
         product_R = np.empty((G, F), np.float32)
         product_V = np.empty((H, H), np.float32)
         product_U = np.empty((H, O), np.float32)
+        ones, column_sums = np.ones(ROWS, np.float32), np.empty(H, np.float32)
         weights = d_weights[c]
         for p in range(bounds[c], bounds[c + 1], ROWS):
             q = min(bounds[c + 1], p + ROWS)
             n = q - p
-            activations(residuals[p:q], index[p:q], shared, R, V1, a1, V2, a2, first[:n], x, h)
+            taken = _chosen(residuals, rows, p, q, own)
+            activations(taken, index[p:q], shared, R, V1, tiles1, V2, tiles2, first[:n], x, h)
             d = d_out[p:q]
             np.dot(d, U_t, dx[:n])
             at = G * F + blocks * 2 * (H * H + H)
@@ -185,26 +228,23 @@ def backward(
                 if want_weights:
                     np.dot(x[b, :n].T, dh[:n], product_V)
                     _add(weights[at:], product_V.ravel(), H * H)
-                    _add_rows(weights[at + H * H : at + H * H + H], dh, n)
+                    np.dot(ones[:n], dh[:n], column_sums)
+                    _add(weights[at + H * H :], column_sums, H)
                     np.dot(h[b, :n].T, dx[:n], product_V)
                     _add(weights[at + H * H + H :], product_V.ravel(), H * H)
-                    _add_rows(weights[at + 2 * H * H + H : at + 2 * H * H + 2 * H], dx, n)
+                    np.dot(ones[:n], dx[:n], column_sums)
+                    _add(weights[at + 2 * H * H + H :], column_sums, H)
                 np.dot(dh[:n], V1_t[b], part[:n])
                 _add(dx.ravel(), part.ravel(), n * H)
-            _leaky_gradient(dx.ravel(), x[0].ravel(), n * H)
-            # `first` has served: it becomes its own gradient.
-            for i in range(n):
-                for j in range(H):
-                    first[i, j] = dx[i, j]
-                for j in range(O):
-                    first[i, H + j] = d[i, j]
+            _first_gradient(first, dx, x[0], d, index[p:q], d_shared)
             if want_weights:
-                np.dot(residuals[p:q].T, first[:n], product_R)
+                np.dot(taken.T, first[:n], product_R)
                 _add(weights, product_R.ravel(), G * F)
             if want_residuals:
-                np.dot(first[:n], R_t, d_residuals[p:q])
-            if want_shared:
-                for i in range(n):
-                    anchor = index[p + i]
-                    for j in range(F):
-                        d_shared[anchor, j] += first[i, j]
+                np.dot(first[:n], R_t, part_own[:n])
+                if len(rows) == 0:
+                    _add(d_residuals[p:q].ravel(), part_own.ravel(), n * G)
+                else:
+                    for i in range(n):
+                        for j in range(G):
+                            d_residuals[rows[p + i], j] += part_own[i, j]

@@ -101,8 +101,8 @@ def pack_splats(
 ) -> PackedSplats:
     """Raises MemoryError for splats that would need absurd amounts of it.
 
-    Means, covariances and determinants may lie in columns 0, 1 and 2, 3, 4 and 6 of `packed` already: a splat's are
-    read before its row is written.
+    All but determinants and depths may lie in `packed` already, opacities in the column of their logarithm: a splat's
+    are read before they are written.
     """
     m = len(means2d)
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
@@ -138,7 +138,7 @@ def list_tiles(splats: PackedSplats, depths: np.ndarray) -> TileLists:
     total = start_tiles(s.counts, starts)
     entries, keys = np.empty((total, 2), np.int32), np.empty(total, np.uint32)
     fill_tiles(s.visible, depths, s.first_slot, s.slots_used, s.slots, s.rows, s.counts, entries, keys)
-    order = np.empty(total, np.int32)
+    order = keys.view(np.int32)
     sort_tiles(starts, keys, order)
     return TileLists(s.visible, s.packed, starts, entries, order, s.first_slot, s.slots_used, s.slots)
 
@@ -313,7 +313,7 @@ def fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, ent
 
 @njit(parallel=True, cache=True)
 def sort_tiles(starts, keys, order):
-    """`order` [E]: each tile's entries by `keys` [E], equal ones as they come."""
+    """`order` [E]: each tile's entries by `keys` [E], equal ones as they come. It may take the place of the keys."""
     tiles = starts.shape[0] - 1
     for turn in prange(turns(tiles)):
         tile = tile_at(turn, tiles)
@@ -328,12 +328,13 @@ def sort_tiles(starts, keys, order):
 @njit(cache=True)
 def sort_few(keys, order, begin):
     """Insertion sort."""
+    sorted_keys = np.empty(FEW, np.uint32)
     for i in range(keys.shape[0]):
         key, at = keys[i], i
-        while at > 0 and keys[order[at - 1] - begin] > key:
-            order[at] = order[at - 1]
+        while at > 0 and sorted_keys[at - 1] > key:
+            sorted_keys[at], order[at] = sorted_keys[at - 1], order[at - 1]
             at -= 1
-        order[at] = begin + i
+        sorted_keys[at], order[at] = key, begin + i
 
 
 @njit(cache=True)

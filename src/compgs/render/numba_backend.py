@@ -4,6 +4,7 @@ means, quaternions, scales ──Project──► means2d, covariances ─┐
 opacities, colors ────────────────────────────────────────────┴──Blend──► image, transmittance
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -37,40 +38,56 @@ def tensors_of(gaussians: Gaussians) -> tuple[Tensor, ...]:
     return g.means, g.quaternions, g.scales, g.opacities, g.colors
 
 
-@torch.no_grad()
 def draw(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> RasterResult:
-    """The same image where no gradient is wanted; what the next part does not need is given back at once."""
-    m = len(gaussians)
-    packed, depths = np.empty((m, PARAMETERS), np.float32), np.empty(m, np.float32)
-    # In the columns that they give way to: rendering stays below three times the size of the decoded model.
-    means2d, covariances, determinants = packed[:, 0:2], packed[:, 2:5], packed[:, 6]
-    project_forward(
-        as_array(gaussians.means),
-        as_array(gaussians.quaternions),
-        as_array(gaussians.scales),
-        camera_numbers(camera, settings),
-        means2d,
-        covariances,
-        depths,
-        determinants,
-    )
+    """The same image where no gradient is wanted."""
+    return draw_parts([gaussians], len(gaussians), camera, settings)
+
+
+@torch.no_grad()
+def draw_parts(
+    parts: Iterable[Gaussians], most: int, camera: Camera, settings: RasterSettings
+) -> RasterResult:
+    """Of Gaussians that come in parts, at most `most` together; no two parts need be in memory."""
+    packed, depths = np.empty((most, PARAMETERS), np.float32), np.empty(most, np.float32)
+    determinants = np.empty(most, np.float32)
+    numbers = camera_numbers(camera, settings)
+    m = 0
+    for gaussians in parts:
+        rows = slice(m, m + len(gaussians))
+        # In the columns that they give way to: memory that is not touched costs nothing.
+        project_forward(
+            as_array(gaussians.means),
+            as_array(gaussians.quaternions),
+            as_array(gaussians.scales),
+            numbers,
+            packed[rows, 0:2],
+            packed[rows, 2:5],
+            depths[rows],
+            determinants[rows],
+        )
+        packed[rows, 5] = as_array(gaussians.opacities)
+        packed[rows, 6:9] = as_array(gaussians.colors)
+        m += len(gaussians)
+        del gaussians
+    packed, depths = packed[:m], depths[:m]
     splats = pack_splats(
-        means2d=means2d,
-        covariances=covariances,
-        determinants=determinants,
+        means2d=packed[:, 0:2],
+        covariances=packed[:, 2:5],
+        determinants=determinants[:m],
         depths=depths,
-        opacities=as_array(gaussians.opacities),
-        colors=as_array(gaussians.colors),
+        opacities=packed[:, 5],
+        colors=packed[:, 6:9],
         width=camera.width,
         height=camera.height,
         settings=settings,
         packed=packed,
     )
+    del determinants
     lists = list_tiles(splats, depths)
     image, transmittance, _ = blend(lists, camera, settings)
     del splats, depths
-    visible = torch.from_numpy(lists.visible)
-    return RasterResult(image, transmittance, torch.from_numpy(means2d.copy()), visible)
+    means2d = torch.from_numpy(packed[:, 0:2].copy())
+    return RasterResult(image, transmittance, means2d, torch.from_numpy(lists.visible))
 
 
 def blend(lists: TileLists, camera: Camera, settings: RasterSettings) -> tuple[Tensor, Tensor, np.ndarray]:

