@@ -44,8 +44,8 @@ def colors_at(points: Points, positions: np.ndarray) -> np.ndarray:
     neighbours = min(COLOR_NEIGHBOURS, len(points))
     distances, nearest = cKDTree(points.positions).query(positions, k=neighbours)
     distances, nearest = (a.reshape(len(positions), neighbours) for a in (distances, nearest))
-    # A point that is met exactly counts much, not infinitely.
-    weights = 1.0 / (distances + 1e-3 * (distances.mean() + np.finfo(np.float64).tiny))
+    # A point that is met exactly counts much, not infinitely, also where all points are in one place.
+    weights = 1.0 / np.maximum(distances + 1e-3 * distances.mean(), np.finfo(np.float32).tiny)
     weights /= weights.sum(1, keepdims=True)
     return (points.colors[nearest] / 255.0 * weights[..., None]).sum(1)
 
