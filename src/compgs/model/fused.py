@@ -100,10 +100,10 @@ class PairedPrediction(torch.autograd.Function):
         appearance, geometry = _halves(weights)
         m = len(drawn)
         shapes = (m, 3), (m, 3), (m, 4), (m,), (m, 3)
-        given = [
+        d_means, d_scales, d_quaternions, d_opacities, d_colors = (
             np.zeros(shape, np.float32) if g is None else g.contiguous().numpy()
             for g, shape in zip(grads, shapes, strict=False)
-        ]
+        )
         d_appearance, d_geometry = np.empty((m, 4), np.float32), np.empty((m, 10), np.float32)
         d_log_scales = torch.zeros_like(reach)
         _finish_gradient(
@@ -113,7 +113,11 @@ class PairedPrediction(torch.autograd.Function):
             scales.detach().numpy(),
             reach.numpy(),
             anchor.numpy(),
-            *given,
+            d_means,
+            d_scales,
+            d_quaternions,
+            d_opacities,
+            d_colors,
             chunk_bounds(anchor.numpy(), CHUNKS),
             d_appearance,
             d_geometry,
