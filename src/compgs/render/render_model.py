@@ -32,8 +32,8 @@ def render(model: Renderable, camera: Camera, settings: RasterSettings | None = 
     bounds = getattr(model, "bounds", None)
     if bounds is None:
         return rasterize(model.gaussians(camera), camera, settings)
-    positions, radii = bounds
-    visible = visible_mask(positions, radii, camera, settings)
+    centers, radii = bounds
+    visible = visible_mask(centers, radii, camera, settings)
     if hasattr(model, "parts"):
         return rasterize_parts(model.parts(camera, visible), model.coupled, camera, settings)  # type: ignore[attr-defined]
     return rasterize(model.gaussians(camera, visible), camera, settings)  # type: ignore[call-arg]
