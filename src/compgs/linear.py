@@ -1,8 +1,8 @@
 """x W + b, with gradients that do not depend on the number of threads.
 
 A weight's gradient is a sum over all rows. BLAS divides such a product among its threads along that sum, so that one
-and two threads round differently, and the same seed gives another file on another machine. Here rows are taken GROUP or
-fewer at a time and summed in PARTS parts, which are then added in order.
+and two threads round differently, and the same seed gives another file on another machine. Here rows are taken in
+groups, too small for BLAS to divide, and summed in PARTS parts, which are then added in order.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from numba import njit, prange
 from torch import Tensor
 
 PARTS = 16
-# Multiplications of a group: BLAS does not divide a product that small among threads.
+# Multiplications of a group: OpenBLAS gives a product that small to one thread.
 GROUP_WORK = 1 << 18
 
 
