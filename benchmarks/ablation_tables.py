@@ -7,7 +7,7 @@ from statistics import fmean, stdev
 from typing import Any
 
 from compgs.errors import ConfigError
-from compgs.evaluation.bd_rate import bd_rate
+from compgs.evaluation.bd_rate import Curve, bd_rate
 
 COUPLED_COMPONENTS = ("masks", "residual hyperprior", "residual embeddings")
 ANCHOR_COMPONENTS = ("positions", "reference hyperprior", "reference embeddings", "covariance")
@@ -166,13 +166,33 @@ def compare_curves(rows: Sequence[Row]) -> list[str]:
         monotone = all(a[1] < b[1] for a, b in itertools.pairwise(ordered))
         lines.append(f"{name}: PSNR {'rises' if monotone else 'does not always rise'} with the bytes")
     for name in others:
-        try:
-            lines.append(
-                f"BD-rate of {name} against {first}: {100 * bd_rate(curves[first], curves[name]):+.1f} %"
+        lines.append(f"BD-rate of {name} against {first}: {described(curves[first], curves[name])}")
+        fronts = front(curves[first]), front(curves[name])
+        if fronts != (sorted(curves[first]), sorted(curves[name])):
+            kept = (
+                f"{len(fronts[0])} of {len(curves[first])} and {len(fronts[1])} of {len(curves[name])} points"
             )
-        except ConfigError as reason:
-            lines.append(f"BD-rate of {name} against {first}: none ({reason})")
+            lines.append(
+                f"the same without points that a smaller file of the curve beats ({kept}): {described(*fronts)}"
+            )
     return lines
+
+
+def described(reference: Curve, test: Curve) -> str:
+    """The BD-rate, or why there is none."""
+    try:
+        return f"{100 * bd_rate(reference, test):+.1f} %"
+    except ConfigError as reason:
+        return f"none ({reason})"
+
+
+def front(curve: Curve) -> list[tuple[float, float]]:
+    """The (bytes, quality) points, ascending, of which no smaller file of the curve has the quality."""
+    best: list[tuple[float, float]] = []
+    for point in sorted(curve):
+        if not best or point[1] > best[-1][1]:
+            best.append(point)
+    return best
 
 
 def report(name: str, scene: str, records: Sequence[Record], command: str) -> str:

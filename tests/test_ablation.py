@@ -9,7 +9,7 @@ import pytest
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 import ablation
-from ablation_tables import bits_each, paired_differences, rows_of
+from ablation_tables import bits_each, front, paired_differences, rows_of
 
 from compgs.cli.main import parse
 from compgs.cli.train import Train
@@ -133,3 +133,9 @@ def test_spreads_and_paired_differences_are_over_seeds() -> None:
     assert rows[0].psnr_spread == pytest.approx(2**0.5)
     assert paired_differences(records) == ["b minus a, same seeds: +1.10 ± 0.14 dB over 2"]
     assert bits_each(rows[0]) == (0.0, 0.0)
+
+
+def test_a_point_that_a_smaller_file_beats_is_not_on_the_front() -> None:
+    curve = [(300.0, 30.0), (100.0, 28.0), (200.0, 27.0), (400.0, 30.0), (250.0, 29.0)]
+    assert front(curve) == [(100.0, 28.0), (250.0, 29.0), (300.0, 30.0)]
+    assert front(front(curve)) == front(curve)
