@@ -3,13 +3,12 @@
 Everything up to the latents is integer arithmetic (reader.py); here they become floats, once.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from compgs.codec.content import STREAMS, FileContent, Latents
+from compgs.codec.content import FileContent, Latents
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.codec.reader import read_latents
 from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile
@@ -29,9 +28,7 @@ def decode(path: str | Path, device: str | torch.device | None = None) -> Hybrid
     except OSError as error:
         raise NotACompGSFile(f"{path}: cannot be read ({error.strerror})") from error
     try:
-        content, latents = read_latents(data)
-        # The symbols have served; with them the peak would be above three times the size of the model.
-        content = replace(content, **dict.fromkeys(STREAMS, np.empty((0, 0), np.int32)))  # type: ignore[arg-type]
+        content, latents = read_latents(data, keep_symbols=False)
         return from_latents(content, latents, torch.device(device or "cpu"))
     except BitstreamError as error:
         raise type(error)(f"{path}: {error}") from error

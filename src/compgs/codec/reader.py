@@ -87,9 +87,10 @@ def read_content(data: bytes) -> FileContent:
     return read_latents(data)[0]
 
 
-def read_latents(data: bytes) -> tuple[FileContent, Latents]:
+def read_latents(data: bytes, *, keep_symbols: bool = True) -> tuple[FileContent, Latents]:
     """The content, and its latents, which the entropy decoder needs anyway (`dequantize` would compute them
-    again).
+    again). Not `keep_symbols`: each stream's symbols go, and are empty in the content, as soon as they have
+    served; with all of them the peak of memory would be above three times the size of the model.
     """
     sections = {section.number: section.data for section in unpack(data)}
     scene = decode_scene(sections[SCENE], SECTION_NAMES[SCENE])
@@ -124,24 +125,33 @@ def read_latents(data: bytes) -> tuple[FileContent, Latents]:
             raise CorruptSection(f"{SECTION_NAMES[number]}: a symbol is not in -{MAX_SYMBOL} to {MAX_SYMBOL}")
         return symbols.reshape(index.shape)
 
+    def kept(symbols: np.ndarray) -> np.ndarray:
+        return symbols if keep_symbols else np.empty((0, 0), np.int32)
+
     index = channel_index(scene.anchors, d.reference_hyper_dim)
     reference_hyper = stream(REFERENCE_HYPER, index, channel_tables(reference_hyper_tables))
     means, index = entropy_parameters(networks["reference"], fixed_point(reference_hyper))
     reference = stream(REFERENCE, index, gaussian)
     reference_latents = reconstruct(reference, means)
+    reference_hyper, reference = kept(reference_hyper), kept(reference)
+    del means, index
 
     means, index = entropy_parameters(networks["covariance"], reference_latents)
     covariance = stream(COVARIANCE, index, gaussian)
     covariance_latents = reconstruct(covariance, means)
+    covariance = kept(covariance)
+    del means, index
 
     index = channel_index(scene.anchors, d.residual_hyper_dim)
     residual_hyper = stream(RESIDUAL_HYPER, index, channel_tables(residual_hyper_tables))
     context = residual_context(residual_hyper, reference_latents)
+    residual_hyper = kept(residual_hyper)
     means, index = entropy_parameters(networks["residual"], context, mask)
     symbols = stream(RESIDUAL, index, gaussian)
     del context, index  # the peak of memory comes next
-    residual = scatter_existing(symbols, mask)
     residual_latents = reconstruct(symbols, means)
+    del means
+    residual = scatter_existing(symbols, mask) if keep_symbols else kept(symbols)
 
     content = FileContent(
         dimensions=d,
