@@ -336,25 +336,22 @@ class Trainer:
         total = self.contributions()
         still = sum(at >= self.step for at in self.pruned_at)
         kept = worth_keeping(total.sum(1), 1.0 - (1.0 - self.pruned_share()) ** still)
-        seen = worth_keeping(total.view(-1), self.config.control.idle_share).view_as(total)
-        self.model.mask = seen & kept[:, None]
+        self.model.mask = self.seen(total) & kept[:, None]
         share = (self.estimated_bytes() - fixed) / (size - fixed) if self.model.mask.any() else 1.0
         self.model.mask = mask
         return share
 
     def finish(self) -> None:
         """Drop coupled primitives that training views hardly see, or not at all, and anchors that have none left."""
-        self.model.mask = self.seen()
+        self.model.mask = self.seen(self.contributions())
         if not self.model.mask.any():
             raise TrainingError("no primitive is visible in any training view; the run has failed")
 
-    @torch.no_grad()
-    def seen(self) -> Tensor:
-        """[N, K] bool: coupled primitives that the training views would miss."""
-        total = self.contributions()
-        return worth_keeping(total.view(-1), self.config.control.idle_share).view_as(total)
+    def seen(self, contributions: Tensor) -> Tensor:
+        """[N, K] bool: coupled primitives that the training views would miss; [N, K] of their `contributions`."""
+        idle_share = self.config.control.idle_share
+        return worth_keeping(contributions.view(-1), idle_share).view_as(contributions)
 
-    @torch.no_grad()
     def prune(self) -> None:
         """Remove the anchors that add least to the training views: what is left of the run makes up for them."""
         kept = worth_keeping(self.contributions().sum(1), self.pruned_share())
@@ -366,6 +363,7 @@ class Trainer:
         control = self.config.control
         return min(0.5, control.prune_share * rate_weight(control, self.rate.lmbda))
 
+    @torch.no_grad()
     def contributions(self) -> Tensor:
         """[N, K] float64: blending weights of the coupled primitives, summed over the pixels of all training views."""
         model, k = self.model, self.config.model.coupled_primitives
@@ -418,10 +416,10 @@ def gaussian_entropy(values: Tensor) -> float:
     return values.numel() * max(0.0, 0.5 * math.log2(2 * math.pi * math.e * variance))
 
 
-def worth_keeping(contributions: Tensor, idle_share: float) -> Tensor:
-    """[P] bool: all but the smallest contributions [P], which together make up at most `idle_share` of the sum."""
+def worth_keeping(contributions: Tensor, share: float) -> Tensor:
+    """[P] bool: all but the smallest contributions [P], which together make up at most `share` of the sum."""
     ascending = contributions.sort(stable=True)
-    idle = ascending.values.cumsum(0) <= idle_share * contributions.sum()
+    idle = ascending.values.cumsum(0) <= share * contributions.sum()
     kept = contributions > 0
     kept[ascending.indices[idle]] = False
     return kept
