@@ -13,9 +13,9 @@
 
 Every variant is a `compgs train` in a process of its own, and every number is that of its decoded file on the held-out
 views; only the row "never rounded" is a model that no file holds, evaluated as it was trained. A variant that is
-finished is not run again, one that was stopped continues: the runs, and a JSON of each with command, settings, commit,
-machine and seconds, stay in --runs. Table (Markdown), figure and all JSON together go to --output, as
-ablation_NAME_SCENE.*.
+finished is not run again, nor is one that another study has run; one that was stopped continues: the runs, and a JSON
+of each with command, settings, commit, machine and seconds, stay in --runs. Table (Markdown), figure and all JSON
+together go to --output, as ablation_NAME_SCENE.*.
 """
 
 import argparse
@@ -34,6 +34,8 @@ from typing import Any
 from ablation_figures import check_matplotlib, figure
 from ablation_tables import Record, report, rows_of
 
+from compgs.cli.main import parse as parse_compgs
+from compgs.cli.train import Train
 from compgs.outputs import write_bytes, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -106,12 +108,28 @@ def train_command(variant: Variant, scene: Path, folder: Path, common: Sequence[
     return ["train", str(scene), "-o", str(folder), *shared, *variant.arguments, "--seed", str(seed)]
 
 
-def finished(record: Path, command: Sequence[str]) -> Record | None:
-    """What is known of a variant that was run with this very command."""
-    if not record.is_file():
-        return None
-    known = json.loads(record.read_text(encoding="utf-8"))
-    return known if known["command"] == list(command) else None
+def settings_of(command: Sequence[str]) -> dict[str, Any]:
+    """What a run trains, by what its config.json will say: method, scene and settings, in whatever words asked for."""
+    train = parse_compgs(list(command))
+    assert isinstance(train, Train) and train.output, f"no training: {command}"
+    asked = train.settings(train.output)
+    content = {"method": asked.method, "scene": asdict(asked.scene), "settings": asked.config.to_dict()}
+    return json.loads(json.dumps(content))
+
+
+def finished(variant: Variant, command: Sequence[str], folder: Path) -> Record | None:
+    """What is known of a training with the same settings, this variant's or another's of any study in the same runs."""
+    wanted = settings_of(command)
+    own = folder.with_name(folder.name + ".json")
+    others = sorted(path for path in folder.parent.parent.glob("*/*.json") if path != own)
+    for path in [own, *others]:
+        known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        if variant.unrounded and "unrounded" not in known:
+            continue
+        if known.get("settings") and {name: known["settings"][name] for name in wanted} == wanted:
+            shown = {"variant": variant.name, "label": variant.label, "curve": variant.curve}
+            return {**known, **shown}
+    return None
 
 
 def run_variant(
@@ -119,7 +137,7 @@ def run_variant(
 ) -> Record:
     """Train, unless that has been done; `run` runs `compgs` with arguments. Raises what it raises."""
     record = folder.with_name(folder.name + ".json")
-    known = finished(record, command)
+    known = finished(variant, command, folder)
     if known is not None:
         return known
     before = folder / "command.json"

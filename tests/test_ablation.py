@@ -12,6 +12,7 @@ import ablation
 from ablation_tables import bits_each, front, paired_differences, rows_of
 
 from compgs.cli.main import parse
+from compgs.cli.run_folder import save_settings
 from compgs.cli.train import Train
 
 
@@ -33,6 +34,10 @@ class Trainings:
         }  # fmt: skip
         (folder / "results.json").write_text(json.dumps(results))
         (folder / "training.json").write_text(json.dumps({"steps": 60}))
+        train = parse(arguments)
+        assert isinstance(train, Train)
+        if not train.resume:
+            save_settings(folder, train.settings(folder))
 
 
 @pytest.mark.parametrize("name", list(ablation.STUDIES))
@@ -69,6 +74,17 @@ def test_a_finished_variant_is_not_run_again_unless_its_settings_change(tmp_path
     assert len(trainings.commands) == 6
     study(tmp_path, trainings, "bitstream", "--seeds", "0", "1", "--steps", "80")
     assert len(trainings.commands) == 12
+
+
+def test_what_another_study_has_trained_is_not_trained_again(tmp_path: Path) -> None:
+    trainings = Trainings()
+    study(tmp_path, trainings, "curve", "--only", "paper_0.001", "paper_0.01")
+    before = len(trainings.commands)
+    text = study(tmp_path, trainings, "bitstream", "--preset", "paper")
+    assert len(trainings.commands) == before + 1  # lambda = 0.005
+    assert "| lambda = 0.001 | 24.55 |" in text
+    study(tmp_path, trainings, "coupled", "--preset", "paper", "--set", "training.lmbda=0.001")
+    assert len(trainings.commands) == before + 3  # K = 5 and 15
 
 
 def test_a_variant_that_was_stopped_continues(tmp_path: Path) -> None:
