@@ -266,6 +266,14 @@ def test_a_file_is_encoded_again_only_to_become_a_smaller_one(
     assert [path.name for path in tmp_path.iterdir()] == ["a.cgs"]
 
 
+def test_a_geometry_program_that_is_missing_is_missed_before_anything_is_computed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    code, _, err = outcome(capsys, "encode", tmp_path / "nowhere", "--geometry", "tmc3")
+    assert code == 1 and "no program 'tmc3' on PATH" in err and err.count("\n") == 1
+
+
 def test_debug_shows_where_an_error_came_from(tmp_path: Path) -> None:
     with pytest.raises(Exception, match="there is no such file"):
         main(["info", str(tmp_path / "nowhere.cgs"), "--debug"])

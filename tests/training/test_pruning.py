@@ -78,3 +78,18 @@ def test_a_run_has_fewer_anchors_where_it_prunes(blob_scene: Scene, tiny_config:
     never = trained(blob_scene, with_pruning(config, 0.05, ()))
     twice = trained(blob_scene, with_pruning(config, 0.05, (0.5, 0.75)))
     assert twice.model.anchors < never.model.anchors
+
+
+def test_pruning_that_falls_on_a_view_of_nothing_happens_all_the_same(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    view = blob_scene.train_views[0]
+    aside = view.camera.world_to_camera.copy()
+    aside[:3, 3] -= 1e4
+    lost = replace(view, camera=replace(view.camera, world_to_camera=aside))
+    config = with_pruning(tiny_config, 0.1, (0.0,))
+    trainer = Trainer(replace(blob_scene, train_views=(lost, *blob_scene.train_views[1:])), config, CPU)
+    trainer.order = [0]  # the first view
+    anchors = trainer.model.anchors
+    trainer.train_step()
+    assert trainer.model.anchors < anchors

@@ -89,6 +89,10 @@ class Encode(ComputingCommand, ReadingOptions):
     def check(self) -> Path:
         """The file to write. Raises what can be said before anything is computed."""
         self.check_reading()
+        if self.geometry == "tmc3":
+            from compgs.codec.tmc3 import find_program
+
+            find_program()
         if self.reduces:
             from compgs.evaluation.reduction import check_reduction
 

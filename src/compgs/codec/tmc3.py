@@ -18,7 +18,7 @@ from compgs.codec.anchor_order import canonical_order
 from compgs.codec.octree import MAXIMUM_ANCHORS
 from compgs.errors import CorruptSection, MissingDependency, NotEncodable
 
-__all__ = ["PROGRAM", "decode_positions_tmc3", "encode_positions_tmc3"]
+__all__ = ["PROGRAM", "decode_positions_tmc3", "encode_positions_tmc3", "find_program"]
 
 PROGRAM = "tmc3"
 TIME_LIMIT = 600  # seconds; TMC13 takes about two per million anchors
@@ -57,7 +57,7 @@ def encode_positions_tmc3(coordinates: NDArray[np.int32]) -> bytes:
 
     Raises MissingDependency without `tmc3`, NotEncodable for what octree.py refuses too or if `tmc3` fails.
     """
-    program = _program()
+    program = find_program()
     if not 1 <= len(coordinates) <= MAXIMUM_ANCHORS:
         raise NotEncodable(f"anchor positions: {len(coordinates)} anchors, expected 1 to {MAXIMUM_ANCHORS}")
     ordered = coordinates[canonical_order(coordinates)].astype(np.int64)  # refuses duplicates and wide clouds
@@ -82,7 +82,7 @@ def decode_positions_tmc3(data: bytes, count: int) -> NDArray[np.int32]:
     if what it decodes is not `count` distinct voxels. How `tmc3` behaves on damaged data is beyond this
     package: it runs in a process of its own, with a time limit.
     """
-    program = _program()
+    program = find_program()
     if len(data) <= 12 or not 1 <= count <= MAXIMUM_ANCHORS:
         raise CorruptSection(f"anchor positions: {len(data)} bytes of G-PCC for {count} anchors")
     origin = np.frombuffer(data, "<i4", 3).astype(np.int64)
@@ -118,7 +118,8 @@ def decode_positions_tmc3(data: bytes, count: int) -> NDArray[np.int32]:
         raise CorruptSection(f"{error} (decoded by {PROGRAM})") from error
 
 
-def _program() -> str:
+def find_program() -> str:
+    """Path of `tmc3`. Raises MissingDependency."""
     program = shutil.which(PROGRAM)
     if program is None:
         raise MissingDependency(

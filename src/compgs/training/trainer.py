@@ -187,17 +187,8 @@ class Trainer:
             gradient = rendered.means2d.grad
             if gradient is not None:
                 self.control.observe(rows, prediction, gradient, view.camera)
-            if self.schedule.due(self.step):
-                self.control.act(
-                    self.model, self.optimizer, self.coupled_means(), self.chance, self.rate.lmbda
-                )
             profile.lap("control")
-        if self.step in self.pruned_at:
-            self.prune()
-            profile.lap("control")
-        profile.end()
-        self.step += 1
-        self.control_rate()
+        self.finish_step()
         return StepResult(loss.detach(), rendered.image.detach(), view)
 
     def revival(self, prediction: Prediction) -> Tensor | float:
@@ -209,10 +200,21 @@ class Trainer:
             return revival_loss(prediction.opacities)
         return 0.0
 
-    def skip(self, view: View) -> StepResult:
-        """A step on a view that no anchor is in: nothing can be learned from it."""
+    def finish_step(self) -> None:
+        """Whatever the step showed: anchors come and go when it is time, and lambda follows the size."""
+        if self.schedule.due(self.step):
+            self.control.act(self.model, self.optimizer, self.coupled_means(), self.chance, self.rate.lmbda)
+            self.profile.lap("control")
+        if self.step in self.pruned_at:
+            self.prune()
+            self.profile.lap("control")
+        self.profile.end()
         self.step += 1
         self.control_rate()
+
+    def skip(self, view: View) -> StepResult:
+        """A step on a view that no anchor is in: nothing can be learned from it."""
+        self.finish_step()
         background = torch.tensor(self.scene.background, device=self.device)
         return StepResult(torch.zeros(()), background.expand(*view.image.shape), view)
 
