@@ -35,6 +35,7 @@ def test_an_unknown_preset_is_named_with_the_known_ones():
         ("training", "checkpoint_minutes", math.nan),
         ("training", "rate", "words"),
         ("training", "hard_rendering", 0.9),
+        ("training", "left_out", -1.0),
         ("control", "start", math.nan),
         ("control", "growth_probability", 7.0),
         ("entropy", "network_hidden", -3),

@@ -125,6 +125,9 @@ class TrainingConfig:
     hard_rendering: float = (
         0.8  # of the steps before rendering sees latents rounded, in place of with noise (soft then hard)
     )
+    left_out: float = (
+        3.0  # over the number of training views: share of the primitives that a step does without, up to 0.2
+    )
     checkpoint_minutes: float = (
         5.0  # between two checkpoints; one is also written when the run is interrupted
     )
@@ -240,6 +243,7 @@ def check_config(config: Config) -> None:
             0 <= t.hard_rendering <= t.hard_rate,
             f"0 to training.hard_rate, {t.hard_rate}",
         ),
+        ("training.left_out", 0 <= t.left_out < 1e6, "0 or more"),
         ("training.head_warm_up", 0 <= t.head_warm_up <= 1, "0 to 1"),
         ("training.sparse_adam", isinstance(t.sparse_adam, bool), "true or false"),
         ("training.appearance_dtype", t.appearance_dtype in ("float32", "bfloat16"), "float32 or bfloat16"),

@@ -37,6 +37,7 @@ from compgs.training.checkpoint import (
     save_checkpoint,
 )
 from compgs.training.control import AdaptiveControl, make_schedule, rate_weight
+from compgs.training.dropout import share_left_out, thinned
 from compgs.training.initial import initial_model
 from compgs.training.loop import (
     StepResult,
@@ -113,6 +114,7 @@ class Trainer:
         self.order: list[int] = []
         self.targets: dict[int, Target] = {}
         self.settings = RasterSettings(background=scene.background)
+        self.left_out = share_left_out(len(scene.train_views), config.training.left_out)
         self.step = 0
         self.rate = RateState(config.training.lmbda)
         self.profile: StepProfile = NoProfile()
@@ -147,7 +149,7 @@ class Trainer:
         )
         profile.lap("entropy")
         prediction = self.predict(latents, rows, view.camera, stored)
-        gaussians = prediction.gaussians
+        gaussians = thinned(prediction.gaussians, self.left_out, self.noise)
         profile.lap("prediction")
         rendered = rasterize(gaussians, view.camera, self.settings)
         profile.lap("projection and rasterization")

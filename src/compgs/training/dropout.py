@@ -1,0 +1,34 @@
+"""Primitives that are left out of a training step by chance (as DropGaussian; Park et al. 2025).
+
+Where few views look, a handful of primitives in front of each camera can explain its photograph and be wrong from
+everywhere else. Whatever must do without some of its neighbours now and then cannot rely on such a trick. With many
+views there is nothing to gain: the share falls with their number.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from compgs.gaussians import Gaussians
+
+MOST = 0.2  # of the primitives, however few the views
+HIGHEST_OPACITY = 0.9999  # of those that make up for the others
+
+
+def share_left_out(views: int, left_out: float) -> float:
+    """Of the primitives of a step, for a number of training views; `left_out` is that share times the views."""
+    return min(MOST, left_out / max(1, views))
+
+
+def thinned(gaussians: Gaussians, share: float, noise: Callable[[Tensor], Tensor]) -> Gaussians:
+    """The `share` of the primitives without opacity, and the others with as much more of it.
+
+    `noise`: uniform in [-0.5, 0.5), of the shape of what it is given.
+    """
+    if share <= 0.0:
+        return gaussians
+    opacities = gaussians.opacities
+    weight = torch.where(noise(opacities) < share - 0.5, 0.0, 1.0 / (1.0 - share))
+    return replace(gaussians, opacities=(opacities * weight).clamp_max(HIGHEST_OPACITY))

@@ -1,0 +1,46 @@
+"""Primitives that are left out of a step by chance."""
+
+import numpy as np
+import pytest
+import torch
+
+from compgs.entropy.quantization import UniformNoise
+from compgs.gaussians import Gaussians
+from compgs.training.dropout import HIGHEST_OPACITY, share_left_out, thinned
+
+
+def gaussians(count: int, opacity: float) -> Gaussians:
+    zero = torch.zeros(count, 3)
+    return Gaussians(
+        zero, torch.ones(count, 4), zero + 0.1, torch.full((count,), opacity).requires_grad_(), zero + 0.5
+    )
+
+
+def noise() -> UniformNoise:
+    return UniformNoise(0, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("share", [0.04, 0.2])
+def test_that_share_is_left_out_and_the_opacity_of_all_together_stays(share: float) -> None:
+    before = gaussians(100_000, 0.5)
+    after = thinned(before, share, noise())
+    gone = after.opacities == 0
+    assert gone.float().mean().item() == pytest.approx(share, rel=0.05)
+    assert after.opacities.mean().item() == pytest.approx(0.5, rel=0.01)
+    assert after.means is before.means
+    after.opacities.sum().backward()
+    assert before.opacities.grad is not None
+    assert torch.equal(before.opacities.grad == 0, gone)
+
+
+def test_no_opacity_reaches_one_and_none_is_left_out_where_none_should_be() -> None:
+    assert float(thinned(gaussians(1000, 0.95), 0.2, noise()).opacities.detach().max()) == pytest.approx(
+        HIGHEST_OPACITY
+    )
+    same = gaussians(10, 0.5)
+    assert thinned(same, 0.0, noise()) is same
+
+
+def test_the_share_falls_with_the_number_of_views_from_a_fifth_at_most() -> None:
+    assert [share_left_out(views, 3.0) for views in (1, 15, 30, 300)] == [0.2, 0.2, 0.1, 0.01]
+    assert share_left_out(5, 0.0) == 0.0
