@@ -140,16 +140,17 @@ def run_variant(
     known = finished(variant, command, folder)
     if known is not None:
         return known
-    before = folder / "command.json"
-    begun = before.is_file() and json.loads(before.read_text(encoding="utf-8")) == command
-    resumable = begun and (folder / "checkpoint.safetensors").is_file()
     start = time.time()
     commit = git_commit()
+    # A run that another version of the program began, or one with other settings, does not become this one.
+    begins = {"command": command, "commit": commit, **settings_of(command)}
+    before = folder / "begun.json"
+    resumable = _json(before) == begins and (folder / "checkpoint.safetensors").is_file()
     if resumable:
         run(["train", "-o", str(folder), "--resume"])
     else:
         # The folder may hold what a run with other settings left.
-        write_json(before, command)
+        write_json(before, begins)
         run([*command, "--overwrite"])
     result: Record = {
         "variant": variant.name,

@@ -104,6 +104,23 @@ def test_a_variant_that_was_stopped_continues(tmp_path: Path) -> None:
     assert trainings.commands == [["train", "-o", str(folder), "--resume"]]
 
 
+def test_a_variant_that_another_version_began_starts_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Stopped(Trainings):
+        def __call__(self, arguments: list[str]) -> None:
+            (tmp_path / "runs" / "coupled" / "scene_k5_seed0" / "checkpoint.safetensors").write_bytes(b"half")
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(ablation, "git_commit", lambda: "first")
+    with pytest.raises(KeyboardInterrupt):
+        study(tmp_path, Stopped(), "coupled", "--only", "k5")
+    monkeypatch.setattr(ablation, "git_commit", lambda: "second")
+    trainings = Trainings()
+    study(tmp_path, trainings, "coupled", "--only", "k5")
+    assert ["--resume" in command for command in trainings.commands] == [False]
+
+
 def test_the_report_says_what_the_runs_said(tmp_path: Path) -> None:
     text = study(tmp_path, Trainings(), "bitstream")
     assert "| lambda = 0.001 | 24.65 | 0.9000 | 90,909 | 100 | 800 |" in text
