@@ -34,7 +34,6 @@ def test_an_unknown_preset_is_named_with_the_known_ones():
         ("training", "quantized_weights", math.nan),
         ("training", "checkpoint_minutes", math.nan),
         ("training", "rate", "words"),
-        ("training", "hard_rendering", 0.9),
         ("training", "left_out", -1.0),
         ("control", "start", math.nan),
         ("control", "growth_probability", 7.0),

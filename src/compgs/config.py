@@ -122,12 +122,7 @@ class TrainingConfig:
     hard_rate: float = (
         0.8  # of the steps before the likelihood sees symbols in place of noise (soft then hard)
     )
-    hard_rendering: float = (
-        0.8  # of the steps before rendering sees latents rounded, in place of with noise (soft then hard)
-    )
-    left_out: float = (
-        3.0  # over the number of training views: share of the primitives that a step does without, up to 0.2
-    )
+    left_out: float = 0.2  # of the primitives, that a step does without, where training views are few
     checkpoint_minutes: float = (
         5.0  # between two checkpoints; one is also written when the run is interrupted
     )
@@ -238,12 +233,7 @@ def check_config(config: Config) -> None:
         ("training.quantized_weights", 0 <= t.quantized_weights <= 1, "0 to 1"),
         ("training.schedule", t.schedule in ("cosine", "exponential"), "cosine or exponential"),
         ("training.hard_rate", 0 <= t.hard_rate <= 1, "0 to 1"),
-        (
-            "training.hard_rendering",
-            0 <= t.hard_rendering <= t.hard_rate,
-            f"0 to training.hard_rate, {t.hard_rate}",
-        ),
-        ("training.left_out", 0 <= t.left_out < 1e6, "0 or more"),
+        ("training.left_out", 0 <= t.left_out <= 0.5, "0 to 0.5"),
         ("training.head_warm_up", 0 <= t.head_warm_up <= 1, "0 to 1"),
         ("training.sparse_adam", isinstance(t.sparse_adam, bool), "true or false"),
         ("training.appearance_dtype", t.appearance_dtype in ("float32", "bfloat16"), "float32 or bfloat16"),

@@ -87,12 +87,10 @@ class TrainedModel(nn.Module):
         noise: Callable[[Tensor], Tensor] | None = None,
         stored_weights: bool = True,
         masked: bool = False,
-        soft: bool = False,
     ) -> Quantized:
         """Quantized latents (in steps) and their bits; see EntropyModel.forward.
 
-        `masked`: bits of those coupled primitives alone that exist. `soft`: latents with `noise` in place of rounding;
-        what their entropy models see of each other is rounded all the same.
+        `masked`: bits of those coupled primitives alone that exist.
         """
 
         def chosen(parameter: Tensor) -> Tensor:
@@ -113,18 +111,9 @@ class TrainedModel(nn.Module):
             network_bits=e.network_bits if stored_weights else None,
             mask=chosen(self.mask) if masked else None,
         )
-        if not e.quantized:
-            return Quantized(references, covariances, residuals.expand(len(references), -1), latents.bits)
-        if soft:
-            assert noise is not None, "noise in place of rounding, but none was given"
-            own = self.config.model.residuals
-            return Quantized(
-                references + noise(references),
-                covariances + noise(covariances),
-                residuals + noise(residuals) if own else latents.residuals,
-                latents.bits,
-            )
-        return latents
+        if e.quantized:
+            return latents
+        return Quantized(references, covariances, residuals.expand(len(references), -1), latents.bits)
 
     def primitives(self, latents: Quantized, rows: Tensor | None = None) -> Primitives:
         """Dequantize: all K coupled primitives of the given anchors, as prediction sees them."""

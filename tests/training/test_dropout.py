@@ -41,6 +41,7 @@ def test_no_opacity_reaches_one_and_none_is_left_out_where_none_should_be() -> N
     assert thinned(same, 0.0, noise()) is same
 
 
-def test_the_share_falls_with_the_number_of_views_from_a_fifth_at_most() -> None:
-    assert [share_left_out(views, 3.0) for views in (1, 15, 30, 300)] == [0.2, 0.2, 0.1, 0.01]
+def test_the_share_is_for_few_views_and_falls_to_nothing_with_more() -> None:
+    assert [share_left_out(views, 0.2) for views in (1, 15, 30, 300)] == [0.2, 0.2, 0.0, 0.0]
+    assert share_left_out(24, 0.2) == pytest.approx(0.08)
     assert share_left_out(5, 0.0) == 0.0

@@ -1,9 +1,8 @@
 """Scalar quantization (CompGS Sec. 3.3).
 
 `y` is a latent in units of its quantization step, `mean` the mean that the entropy model predicts for it, `y_hat` the
-value that the decoder will have. Training sees rounded values with a straight-through gradient, or values with uniform
-noise in place of rounding (Ballé et al. 2017). In the authors' release rendering sees the former and the likelihood the
-latter; here both begin with noise and end rounded (Guo et al. 2021, "Soft then hard"), each when the settings say.
+value that the decoder will have. Rendering sees rounded values with a straight-through gradient, the likelihood sees
+values with uniform noise (Ballé et al. 2017); both as in the authors' release.
 """
 
 from typing import Any

@@ -2,7 +2,7 @@
 
 Where few views look, a handful of primitives in front of each camera can explain its photograph and be wrong from
 everywhere else. Whatever must do without some of its neighbours now and then cannot rely on such a trick. With many
-views there is nothing to gain: the share falls with their number.
+views there is nothing to gain (docs/results/experiments.md, fourth series).
 """
 
 from collections.abc import Callable
@@ -13,13 +13,15 @@ from torch import Tensor
 
 from compgs.gaussians import Gaussians
 
-MOST = 0.2  # of the primitives, however few the views
+FEW_VIEWS = 15  # and fewer are few; twice as many are not any more
 HIGHEST_OPACITY = 0.9999  # of those that make up for the others
 
 
-def share_left_out(views: int, left_out: float) -> float:
-    """Of the primitives of a step, for a number of training views; `left_out` is that share times the views."""
-    return min(MOST, left_out / max(1, views))
+def share_left_out(views: int, most: float) -> float:
+    """Of the primitives of a step, for a number of training views: `most` where they are few, nothing where they are
+    many.
+    """
+    return most * min(1.0, max(0.0, 2.0 - views / FEW_VIEWS))
 
 
 def thinned(gaussians: Gaussians, share: float, noise: Callable[[Tensor], Tensor]) -> Gaussians:

@@ -145,7 +145,6 @@ class Trainer:
             rate=progress >= t.rate_start,
             noise=self.noise if progress < t.hard_rate else None,
             stored_weights=stored,
-            soft=progress < t.hard_rendering,
         )
         profile.lap("entropy")
         prediction = self.predict(latents, rows, view.camera, stored)
