@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from compgs.gaussians import Gaussians
+from compgs.model.prediction import Prediction
 
 FEW_VIEWS = 15  # and fewer are few; twice as many are not any more
 HIGHEST_OPACITY = 0.9999  # of those that make up for the others
@@ -24,13 +25,15 @@ def share_left_out(views: int, most: float) -> float:
     return most * min(1.0, max(0.0, 2.0 - views / FEW_VIEWS))
 
 
-def thinned(gaussians: Gaussians, share: float, noise: Callable[[Tensor], Tensor]) -> Gaussians:
+def thinned(prediction: Prediction, share: float, noise: Callable[[Tensor], Tensor]) -> Gaussians:
     """The `share` of the primitives without opacity, and the others with as much more of it.
 
-    `noise`: uniform in [-0.5, 0.5), of the shape of what it is given.
+    `noise`: uniform in [-0.5, 0.5), of the shape of what it is given: all coupled primitives, so that chance does not
+    depend on which of them were predicted at all.
     """
+    gaussians = prediction.gaussians
     if share <= 0.0:
         return gaussians
-    opacities = gaussians.opacities
-    weight = torch.where(noise(opacities) < share - 0.5, 0.0, 1.0 / (1.0 - share))
-    return replace(gaussians, opacities=(opacities * weight).clamp_max(HIGHEST_OPACITY))
+    chance = noise(prediction.opacities).index_select(0, prediction.index)
+    weight = torch.where(chance < share - 0.5, 0.0, 1.0 / (1.0 - share))
+    return replace(gaussians, opacities=(gaussians.opacities * weight).clamp_max(HIGHEST_OPACITY))

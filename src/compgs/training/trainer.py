@@ -148,7 +148,7 @@ class Trainer:
         )
         profile.lap("entropy")
         prediction = self.predict(latents, rows, view.camera, stored)
-        gaussians = thinned(prediction.gaussians, self.left_out, self.noise)
+        gaussians = thinned(prediction, self.left_out, self.noise)
         profile.lap("prediction")
         rendered = rasterize(gaussians, view.camera, self.settings)
         profile.lap("projection and rasterization")
