@@ -241,8 +241,10 @@ def test_an_odd_scene_is_learned_and_its_file_shows_it(name: str, config: Config
     assert gain(decoded, scene.train_views) > 1.5
     for view in scene.train_views[:3]:
         ours, theirs = render(model.as_hybrid_model(), view.camera), render(decoded, view.camera)
-        # 60 dB: sums in another order move single pixels across the rasterizer's cutoff.
-        assert (ours.image - theirs.image).square().mean() < 1e-6
+        # Sums in another order move single pixels across the rasterizer's cutoff: not all, but nearly all are the same.
+        difference = (ours.image - theirs.image).abs()
+        assert difference.square().mean() < 1e-6
+        assert difference.flatten().quantile(0.99) < 1e-3
 
 
 @pytest.mark.parametrize("name", ["portrait", "forward_facing", "differing_sizes", "one_object_on_white"])
