@@ -91,7 +91,7 @@ class TrainingConfig:
     steps: int = 30_000  # one view each
     seed: int = 0
     lmbda: float = (
-        0.003  # weight of the rate; 0: the entropy networks learn what the latents cost, these do not care
+        0.002  # weight of the rate; 0: the entropy networks learn what the latents cost, these do not care
     )
     target_bytes: int | None = None  # size of the file to aim at: lambda, from its setting on, follows it
     rate: Literal["bits", "elements"] = (
@@ -101,7 +101,7 @@ class TrainingConfig:
     rate_start: float = 0.1  # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
     ssim_weight: float = 0.2  # (1 - w) L1 + w (1 - SSIM) (3DGS)
     scale_weight: float = 0.01  # mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
-    embedding_lr: tuple[float, float] = (0.1, 3e-4)  # quantization steps per training step, first and last
+    embedding_lr: tuple[float, float] = (0.05, 3e-4)  # quantization steps per training step, first and last
     log_scale_lr: tuple[float, float] = (0.007, 0.007)  # Ref.
     translation_lr: tuple[float, float] = (2e-3, 2e-5)  # Ref.
     covariance_lr: tuple[float, float] = (4e-3, 4e-5)  # Ref.
