@@ -8,7 +8,7 @@
 | residuals | Table 5: coupled primitives without residual embeddings of their own, and with |
 | coupled | K = 5, 10, 15 coupled primitives per anchor |
 | bitstream | bytes and bits by component at lambda = 0.001, 0.005, 0.01 |
-| curve | rate-distortion curves of the presets `paper` and `default`, lambda = 1e-5 to 1e-1, and their BD-rate |
+| curve | rate-distortion curves of the presets `paper` and `default`, lambda = 1e-6 to 1e-1, and their BD-rate |
 | quantization | latents trained and stored rounded; the same seeds never rounded; and those rounded afterwards |
 
 Every variant is a `compgs train` in a process of its own, and every number is that of its decoded file on the held-out
@@ -39,7 +39,7 @@ from compgs.cli.train import Train
 from compgs.outputs import write_bytes, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
-LAMBDAS = (1e-5, 1e-4, 1e-3, 5e-3, 1e-2, 3e-2, 1e-1)
+LAMBDAS = (1e-6, 1e-5, 1e-4, 1e-3, 5e-3, 1e-2, 3e-2, 1e-1)
 
 
 @dataclass(frozen=True)
