@@ -60,7 +60,7 @@ def draw_points(axes: Any, rows: Sequence[Row]) -> None:
             )
     sizes = [row.bytes for row in rows if row.bytes]
     if sizes and max(sizes) > 5 * min(sizes):
-        axes.set_xscale("log")
+        logarithmic_sizes(axes)
     axes.legend(fontsize=8)
 
 
@@ -69,8 +69,18 @@ def draw_curves(axes: Any, rows: Sequence[Row]) -> None:
     for name, points in curves_of(rows).items():
         sizes, quality = zip(*sorted(points), strict=True)
         axes.plot([size / 1e3 for size in sizes], quality, marker="o", label=name)
-    axes.set_xscale("log")
+    logarithmic_sizes(axes)
     axes.legend(fontsize=8)
+
+
+def logarithmic_sizes(axes: Any) -> None:
+    """1, 2, 5, 10, 20, ... in plain numbers: labels that neither overlap nor have exponents."""
+    from matplotlib import ticker
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_locator(ticker.NullLocator())
 
 
 def draw_components(axes: Any, rows: Sequence[Row]) -> None:
