@@ -12,7 +12,7 @@ went on integrating would run away for nothing.
 import math
 from dataclasses import dataclass, replace
 
-LOWEST, HIGHEST = 1e-6, 1.0  # of lambda
+LOWEST, HIGHEST = 1e-6, 1.0  # of lambda; below, growth does not follow it any more (control.LAMBDA_RANGE)
 LOOKS = 100  # at the size in a run: a look costs about as much as a training step
 FIRST_LOOK = (
     0.1  # of the run after the rate has joined the loss: the entropy networks begin by knowing nothing
