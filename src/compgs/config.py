@@ -53,6 +53,8 @@ class EntropyConfig:
     covariance_step: float = (
         0.15  # initial learned step of the anchors' log scales (0.01 in Sec. 3.4: bits for what nobody sees)
     )
+    # of the steps: references are turned into their principal axes (not in the paper)
+    decorrelate_at: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
     quantized: bool = True  # False: latents are trained unrounded, as a bound that no file reaches (ablation)
     network_hidden: int = 0  # hidden width of the entropy networks; 0: one linear layer (Ref.)
     network_bits: int = (
@@ -219,6 +221,7 @@ def check_config(config: Config) -> None:
         ("entropy.reference_step", 0 < e.reference_step < 1e3, "above 0"),
         ("entropy.residual_step", 0 < e.residual_step < 1e3, "above 0"),
         ("entropy.covariance_step", 0 < e.covariance_step < 10, "above 0"),
+        ("entropy.decorrelate_at", all(0 <= at <= 1 for at in e.decorrelate_at), "numbers from 0 to 1"),
         ("entropy.network_bits", 6 <= e.network_bits <= 16, "6 to 16"),
         ("entropy.head_bits", 6 <= e.head_bits <= 16, "6 to 16"),
         ("training.steps", 1 <= t.steps <= 10_000_000, "1 to 10000000"),

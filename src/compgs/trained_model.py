@@ -4,7 +4,7 @@ Training optimizes it, the encoder turns it into a file, `as_hybrid_model` into 
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +13,7 @@ from compgs.config import Config
 from compgs.entropy.models import EntropyModel, Quantized
 from compgs.entropy.quantization import quantize_weight
 from compgs.model.hybrid_model import HybridModel
+from compgs.model.layers import ResidualMLP
 from compgs.model.prediction import PredictionHeads
 from compgs.model.primitives import Primitives, every_slot
 
@@ -73,6 +74,15 @@ class TrainedModel(nn.Module):
     def anchor_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that have a row for each anchor."""
         return ("log_scales", "references", *(("residuals",) if self.config.model.residuals else ()))
+
+    def along_references(self) -> Iterator[tuple[Tensor, int, int]]:
+        """Parameters with a dimension along the references' channels: that dimension, and where these begin in it."""
+        yield self.references, 1, 0
+        for head in self.heads.children():
+            assert isinstance(head, ResidualMLP)
+            yield head.input_weight, 0, 0
+            yield head.skip_weight, 0, 0
+        yield from self.entropy.along_references()
 
     def share_residuals(self) -> None:
         """The file has the residuals that all anchors share as what it expects: no symbol is other than zero."""

@@ -5,10 +5,11 @@ primitives, flattened; `z` hyperpriors. All latents are in units of their quanti
 `bits` are total bits of an anchor's row; `losses.py` alone divides them, and says by what.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -25,6 +26,8 @@ STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "resi
 SLOT_SPREAD = 0.4
 # Below this step, the log scales leave the range of the decoder's fixed-point numbers.
 SMALLEST_COVARIANCE_STEP = 0.005
+# Of scales that are set from the data, in steps: one symbol in eighty is other than zero there.
+SMALLEST_SPREAD = 0.2
 
 
 class HyperAnalysis(nn.Module):
@@ -104,6 +107,30 @@ class EntropyModel(nn.Module):
         values = log_scales.double().cpu().numpy()  # numpy's sums do not depend on the number of threads
         network.biases[-1][:channels] = float(values.mean()) / (step * network.gain[0])
         network.biases[-1][channels:] = (max(float(values.std(ddof=1)), 0.1) / step).log2()
+
+    def along_references(self) -> Iterator[tuple[Tensor, int, int]]:
+        """Parameters with a dimension along the references' channels: that dimension, and where these begin in it."""
+        yield self.reference_analysis.first.weight, 1, 0
+        yield self.reference_network.weights[-1], 0, 0  # rows of the means; those of the scales follow them
+        yield self.reference_network.biases[-1], 0, 0
+        yield self.covariance_network.weights[0], 1, 0
+        if self.own_residuals:
+            hyper = self.residual_network.weights[0].shape[1] - self.reference_network.channels
+            yield self.residual_network.weights[0], 1, hyper
+
+    @torch.no_grad()
+    def restart_reference_scales(self, references: Tensor) -> tuple[nn.Parameter, nn.Parameter]:
+        """Scales of the references as they are now, [N, reference_dim], whatever the hyperprior says of them; the two
+        parameters whose second halves these are.
+        """
+        network = self.reference_network
+        mean, _ = network(round_straight_through(self.reference_analysis(references)))
+        # numpy's sums do not depend on the number of threads
+        spread = (references - mean).double().cpu().numpy().std(0)
+        weight, bias = network.weights[-1], network.biases[-1]
+        weight[network.channels :] = 0
+        bias[network.channels :] = torch.from_numpy(np.log2(np.maximum(spread, SMALLEST_SPREAD)))
+        return weight, bias
 
     def starting_residuals(self) -> Tensor:
         """[K * residual_dim] residual embedding that a new anchor starts with, in quantization steps."""

@@ -37,6 +37,7 @@ from compgs.training.checkpoint import (
     save_checkpoint,
 )
 from compgs.training.control import AdaptiveControl, make_schedule, rate_weight
+from compgs.training.decorrelation import decorrelate
 from compgs.training.dropout import share_left_out, thinned
 from compgs.training.initial import initial_model
 from compgs.training.loop import (
@@ -107,6 +108,9 @@ class Trainer:
         self.optimizer = make_optimizer(self.model, config.training)
         self.schedule = make_schedule(config.control, config.training.steps, len(scene.train_views))
         self.pruned_at = {round(share * config.training.steps) for share in config.control.prune_at}
+        self.decorrelated_at = {
+            round(share * config.training.steps) for share in config.entropy.decorrelate_at
+        }
         self.control = AdaptiveControl(config, self.schedule, self.model.anchors, device)
         self.chance = torch.Generator(device).manual_seed(config.training.seed + 1)  # of growth
         self.shuffle = np.random.default_rng(config.training.seed + 2)
@@ -203,12 +207,15 @@ class Trainer:
         return 0.0
 
     def finish_step(self) -> None:
-        """Whatever the step showed: anchors come and go when it is time, and lambda follows the size."""
+        """Whatever the step showed: anchors come and go when it is time, references turn, lambda follows the size."""
         if self.schedule.due(self.step):
             self.control.act(self.model, self.optimizer, self.coupled_means(), self.chance, self.rate.lmbda)
             self.profile.lap("control")
         if self.step in self.pruned_at:
             self.prune()
+            self.profile.lap("control")
+        if self.step in self.decorrelated_at:
+            decorrelate(self.model, self.optimizer)
             self.profile.lap("control")
         self.profile.end()
         self.step += 1

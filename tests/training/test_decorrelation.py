@@ -1,0 +1,154 @@
+"""References in their principal axes: the same scene, fewer bits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from compgs.config import Config, load_config
+from compgs.scene.views import Scene
+from compgs.training import trainer as trainer_module
+from compgs.training.decorrelation import decorrelate, principal_axes
+from compgs.training.trainer import Trainer
+
+CPU = torch.device("cpu")
+
+
+def trained(scene: Scene, config: Config, steps: int = 12, **entropy: object) -> Trainer:
+    """A short run without turns, on latents whose channels have much in common."""
+    config = replace(config, entropy=replace(config.entropy, decorrelate_at=(), **entropy))
+    trainer = Trainer(scene, config, CPU)
+    references = trainer.model.references
+    generator = torch.Generator().manual_seed(5)
+    channels = references.shape[1]
+    mixing = torch.randn(3, channels, generator=generator)
+    with torch.no_grad():
+        references += torch.randn(len(references), 3, generator=generator) @ mixing * 3
+    for _ in range(steps):
+        trainer.train_step()
+    return trainer
+
+
+def latents_and_image(trainer: Trainer) -> tuple[torch.Tensor, ...]:
+    view = trainer.scene.train_views[2]
+    rows = trainer.visible_anchors(view.camera)
+    latents = trainer.model.quantized(rows, stored_weights=False)
+    prediction = trainer.predict(latents, rows, view.camera, stored=False)
+    g = prediction.gaussians
+    return g.means, g.scales, g.opacities, g.colors
+
+
+@pytest.mark.parametrize("heads", ["paired", "separate"])
+@pytest.mark.parametrize("residuals", [True, False])
+def test_without_rounding_the_scene_stays_the_same(
+    blob_scene: Scene, tiny_config: Config, heads: str, residuals: bool
+) -> None:
+    model = replace(tiny_config.model, heads=heads, residuals=residuals)
+    trainer = trained(blob_scene, replace(tiny_config, model=model), quantized=False)
+    before = latents_and_image(trainer)
+    was = trainer.model.references.detach().clone()
+    decorrelate(trainer.model, trainer.optimizer)
+    assert not torch.allclose(trainer.model.references, was, atol=0.1)
+    for old, new in zip(before, latents_and_image(trainer), strict=True):
+        torch.testing.assert_close(new, old, atol=2e-4, rtol=2e-4)
+
+
+def test_what_the_entropy_model_expects_turns_with_the_references(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    """Means of references, covariances and residuals from unrounded contexts: of covariances and residuals the same
+    numbers, of references the same vectors in other axes.
+    """
+    trainer = trained(blob_scene, tiny_config)
+    model, entropy = trainer.model, trainer.model.entropy
+
+    def expected() -> tuple[torch.Tensor, ...]:
+        z = entropy.reference_analysis(model.references)
+        hyper = torch.ones(model.anchors, trainer.config.entropy.residual_hyper_dim)
+        return (
+            entropy.reference_network(z)[0],
+            z,
+            *entropy.covariance_network(model.references),
+            *entropy.residual_network(torch.cat([hyper, model.references], 1)),
+        )
+
+    with torch.no_grad():
+        before = expected()
+        axes = principal_axes(model.references)
+        decorrelate(model, trainer.optimizer)
+        after = expected()
+    torch.testing.assert_close(after[0], before[0] @ axes, atol=1e-3, rtol=1e-3)
+    for old, new in zip(before[1:], after[1:], strict=True):
+        torch.testing.assert_close(new, old, atol=1e-3, rtol=1e-3)
+
+
+def test_channels_are_uncorrelated_afterwards_and_the_largest_come_first(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    trainer = trained(blob_scene, tiny_config)
+    before = np.cov(trainer.model.references.detach().double().numpy().T)
+    decorrelate(trainer.model, trainer.optimizer)
+    after = np.cov(trainer.model.references.detach().double().numpy().T)
+    variances = np.diag(after)
+    assert np.abs(before - np.diag(np.diag(before))).max() > 1
+    assert np.abs(after - np.diag(variances)).max() < 1e-4 * variances.max()
+    assert (np.diff(variances) <= 1e-6).all()
+    np.testing.assert_allclose(variances.sum(), np.trace(before), rtol=1e-5)
+
+
+def test_correlated_references_take_fewer_bits_in_their_axes(blob_scene: Scene, tiny_config: Config) -> None:
+    trainer = trained(blob_scene, tiny_config)
+    model = trainer.model
+    model.entropy.restart_reference_scales(model.references)
+    before = model.estimated_bits()
+    decorrelate(model, trainer.optimizer)
+    after = model.estimated_bits()
+    assert after["reference"] < 0.85 * before["reference"]
+    assert after["covariance"] == pytest.approx(before["covariance"], rel=0.02)
+
+
+def test_a_step_with_momentum_does_not_care_when_the_axes_turn(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    trainer = trained(blob_scene, tiny_config)
+    model, optimizer = trainer.model, trainer.optimizer
+    axes = principal_axes(model.references)
+    momentum = optimizer.state[model.references]["exp_avg"].clone()
+    moved = (model.references - 0.1 * momentum) @ axes
+    second = optimizer.state[model.references]["exp_avg_sq"].clone()
+    decorrelate(model, optimizer)
+    state = optimizer.state[model.references]
+    torch.testing.assert_close(model.references - 0.1 * state["exp_avg"], moved, atol=1e-4, rtol=1e-4)
+    assert (state["exp_avg_sq"] >= 0).all()
+    torch.testing.assert_close(state["exp_avg_sq"].sum(1), second.sum(1), atol=1e-12, rtol=1e-4)
+
+
+def test_fewer_anchors_than_channels_are_no_trouble(blob_scene: Scene, tiny_config: Config) -> None:
+    trainer = trained(blob_scene, tiny_config)
+    kept = torch.zeros(trainer.model.anchors, dtype=torch.bool)
+    for anchors in (3, 1):
+        kept[:] = False
+        kept[:anchors] = True
+        trainer.control.keep(trainer.model, trainer.optimizer, kept)
+        decorrelate(trainer.model, trainer.optimizer)
+        kept = kept[:anchors]
+        assert torch.isfinite(trainer.model.references).all()
+        assert np.isfinite(sum(trainer.model.estimated_bits().values()))
+
+
+def test_it_happens_at_the_steps_that_the_settings_name(
+    blob_scene: Scene, tiny_config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = replace(tiny_config, entropy=replace(tiny_config.entropy, decorrelate_at=(0.2, 0.5)))
+    trainer = Trainer(blob_scene, config, CPU)
+    turned: list[int] = []
+    monkeypatch.setattr(trainer_module, "decorrelate", lambda *_: turned.append(trainer.step))
+    for _ in range(config.training.steps):
+        trainer.train_step()
+    assert turned == [8, 20]
+
+
+def test_the_paper_preset_does_without() -> None:
+    assert load_config("paper").entropy.decorrelate_at == ()
+    assert load_config().entropy.decorrelate_at
