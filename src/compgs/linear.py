@@ -5,6 +5,7 @@ and two threads round differently, and the same seed gives another file on anoth
 groups, too small for BLAS to divide, and summed in PARTS parts, which are then added in order.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,17 @@ from torch import Tensor
 PARTS = 16
 # Multiplications of a group: OpenBLAS gives a product that small to one thread.
 GROUP_WORK = 1 << 18
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A linear layer that takes references, among other things: weight, and what it adds to in the layer."""
+
+    weight: Tensor
+    bias: Tensor
+    dimension: int  # of the weight: its inputs
+    first: int  # input that is the references' first channel
+    unit: float  # what the layer takes a quantization step of them for
 
 
 def linear(

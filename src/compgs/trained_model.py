@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from compgs.config import Config
 from compgs.entropy.models import EntropyModel, Quantized
 from compgs.entropy.quantization import quantize_weight
+from compgs.linear import Reader
 from compgs.model.hybrid_model import HybridModel
-from compgs.model.layers import ResidualMLP
 from compgs.model.prediction import PredictionHeads
 from compgs.model.primitives import Primitives, every_slot
 
@@ -62,6 +62,11 @@ class TrainedModel(nn.Module):
         return len(self.coordinates)
 
     @property
+    def reference_dim(self) -> int:
+        """Channels of the references now: those that came to say nothing are gone."""
+        return self.references.shape[1]
+
+    @property
     def device(self) -> torch.device:
         return self.log_scales.device
 
@@ -75,14 +80,10 @@ class TrainedModel(nn.Module):
         """Names of the parameters that have a row for each anchor."""
         return ("log_scales", "references", *(("residuals",) if self.config.model.residuals else ()))
 
-    def along_references(self) -> Iterator[tuple[Tensor, int, int]]:
-        """Parameters with a dimension along the references' channels: that dimension, and where these begin in it."""
-        yield self.references, 1, 0
-        for head in self.heads.children():
-            assert isinstance(head, ResidualMLP)
-            yield head.input_weight, 0, 0
-            yield head.skip_weight, 0, 0
-        yield from self.entropy.along_references()
+    def readers(self) -> Iterator[Reader]:
+        """The layers that take the references."""
+        yield from self.heads.readers(self.config.entropy.reference_step)
+        yield from self.entropy.readers()
 
     def share_residuals(self) -> None:
         """The file has the residuals that all anchors share as what it expects: no symbol is other than zero."""

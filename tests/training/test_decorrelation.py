@@ -1,15 +1,23 @@
 """References in their principal axes: the same scene, fewer bits."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from compgs.codec import decode, encode
 from compgs.config import Config, load_config
 from compgs.scene.views import Scene
 from compgs.training import trainer as trainer_module
-from compgs.training.decorrelation import decorrelate, principal_axes
+from compgs.training.checkpoint import load_checkpoint
+from compgs.training.decorrelation import (
+    channel_rates,
+    decorrelate,
+    drop_silent_channels,
+    principal_axes,
+)
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -30,7 +38,7 @@ def trained(scene: Scene, config: Config, steps: int = 12, **entropy: object) ->
     return trainer
 
 
-def latents_and_image(trainer: Trainer) -> tuple[torch.Tensor, ...]:
+def predicted(trainer: Trainer) -> tuple[torch.Tensor, ...]:
     view = trainer.scene.train_views[2]
     rows = trainer.visible_anchors(view.camera)
     latents = trainer.model.quantized(rows, stored_weights=False)
@@ -46,11 +54,11 @@ def test_without_rounding_the_scene_stays_the_same(
 ) -> None:
     model = replace(tiny_config.model, heads=heads, residuals=residuals)
     trainer = trained(blob_scene, replace(tiny_config, model=model), quantized=False)
-    before = latents_and_image(trainer)
+    before = predicted(trainer)
     was = trainer.model.references.detach().clone()
     decorrelate(trainer.model, trainer.optimizer)
     assert not torch.allclose(trainer.model.references, was, atol=0.1)
-    for old, new in zip(before, latents_and_image(trainer), strict=True):
+    for old, new in zip(before, predicted(trainer), strict=True):
         torch.testing.assert_close(new, old, atol=2e-4, rtol=2e-4)
 
 
@@ -124,6 +132,29 @@ def test_a_step_with_momentum_does_not_care_when_the_axes_turn(
     torch.testing.assert_close(state["exp_avg_sq"].sum(1), second.sum(1), atol=1e-12, rtol=1e-4)
 
 
+def test_learning_rates_follow_the_root_of_the_spread_down_to_a_limit() -> None:
+    references = torch.randn(4000, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    references = references / references.std(0, correction=0) * torch.tensor([4.0, 1.0, 0.1])
+    torch.testing.assert_close(channel_rates(references), torch.tensor([3.5, 1.75, 0.6]).double())
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_each_channel_moves_as_far_as_its_rate_says(
+    blob_scene: Scene, tiny_config: Config, sparse: bool
+) -> None:
+    config = replace(tiny_config, training=replace(tiny_config.training, sparse_adam=sparse))
+    plain, other = trained(blob_scene, config), trained(blob_scene, config)
+    assert torch.equal(plain.model.references, other.model.references)
+    before = plain.model.references.detach().clone()
+    rates = torch.linspace(0.0, 3.5, before.shape[1])
+    other.reference_rates = rates
+    plain.train_step()
+    other.train_step()
+    moved = plain.model.references.detach() - before
+    assert moved.abs().max() > 1e-3
+    torch.testing.assert_close(other.model.references.detach() - before, moved * rates, atol=2e-5, rtol=1e-4)
+
+
 def test_fewer_anchors_than_channels_are_no_trouble(blob_scene: Scene, tiny_config: Config) -> None:
     trainer = trained(blob_scene, tiny_config)
     kept = torch.zeros(trainer.model.anchors, dtype=torch.bool)
@@ -135,6 +166,85 @@ def test_fewer_anchors_than_channels_are_no_trouble(blob_scene: Scene, tiny_conf
         kept = kept[:anchors]
         assert torch.isfinite(trainer.model.references).all()
         assert np.isfinite(sum(trainer.model.estimated_bits().values()))
+
+
+@pytest.mark.parametrize("heads", ["paired", "separate"])
+@pytest.mark.parametrize("residuals", [True, False])
+def test_a_channel_that_is_the_same_everywhere_can_go_without_a_change(
+    blob_scene: Scene, tiny_config: Config, heads: str, residuals: bool
+) -> None:
+    model = replace(tiny_config.model, heads=heads, residuals=residuals)
+    trainer = trained(blob_scene, replace(tiny_config, model=model), quantized=False)
+    with torch.no_grad():
+        trainer.model.references[:, [2, 7]] = torch.tensor([1.7, -0.4])
+    before = predicted(trainer)
+    covariances = trainer.model.entropy.covariance_network(trainer.model.references)
+    drop_silent_channels(trainer.model, trainer.optimizer)
+    assert trainer.model.reference_dim == tiny_config.model.reference_dim - 2
+    for old, new in zip(before, predicted(trainer), strict=True):
+        torch.testing.assert_close(new, old, atol=2e-4, rtol=2e-4)
+    for old, new in zip(
+        covariances, trainer.model.entropy.covariance_network(trainer.model.references), strict=True
+    ):
+        torch.testing.assert_close(new, old, atol=1e-3, rtol=1e-3)
+    trainer.train_step()  # Adam's moments fit, too, while graphs of the old shapes are still there
+
+
+def test_a_file_of_fewer_channels_decodes_to_the_trained_latents(
+    blob_scene: Scene, tiny_config: Config, tmp_path: Path
+) -> None:
+    trainer = trained(blob_scene, tiny_config, steps=20)
+    with torch.no_grad():
+        trainer.model.references[:, :3] = 0.2
+    drop_silent_channels(trainer.model, trainer.optimizer)
+    encode(trainer.model, tmp_path / "scene.cgs")
+    decoded = decode(tmp_path / "scene.cgs").primitives.references
+    expected = trainer.model.primitives(trainer.model.quantized()).references
+    assert decoded.shape == expected.shape == (trainer.model.anchors, tiny_config.model.reference_dim - 3)
+    torch.testing.assert_close(decoded.sort(0).values, expected.sort(0).values, atol=1e-3, rtol=0)
+
+
+def test_one_channel_stays_when_none_says_anything(blob_scene: Scene, tiny_config: Config) -> None:
+    trainer = trained(blob_scene, tiny_config, steps=1)
+    with torch.no_grad():
+        trainer.model.references[:] = torch.linspace(0, 0.1, trainer.model.anchors)[:, None]
+        trainer.model.references[:, 1] *= 2
+    drop_silent_channels(trainer.model, trainer.optimizer)
+    assert trainer.model.reference_dim == 1
+
+
+def test_a_run_with_fewer_channels_continues_exactly(
+    blob_scene: Scene, tiny_config: Config, tmp_path: Path
+) -> None:
+    config = replace(tiny_config, entropy=replace(tiny_config.entropy, decorrelate_at=(0.2, 0.4)))
+
+    def started() -> Trainer:
+        trainer = Trainer(blob_scene, config, CPU)
+        with torch.no_grad():
+            trainer.model.references[:, 3:] = 0.0
+        for group in trainer.optimizer.param_groups:
+            if group["name"] == "references":
+                group["rates"] = (1e-3, 1e-3)  # so that they stay nearly there
+        return trainer
+
+    whole = started()
+    while whole.step < 24:
+        whole.train_step()
+    assert whole.model.reference_dim < config.model.reference_dim
+    first = started()
+    while first.step < 20:
+        first.train_step()
+    first.save(tmp_path / "checkpoint.safetensors")
+    second = Trainer.resumed(blob_scene, load_checkpoint(tmp_path / "checkpoint.safetensors"), config, CPU)
+    for group in second.optimizer.param_groups:
+        if group["name"] == "references":
+            group["rates"] = (1e-3, 1e-3)
+    while second.step < 24:
+        second.train_step()
+    for (name, old), new in zip(
+        whole.model.state_dict().items(), second.model.state_dict().values(), strict=True
+    ):
+        assert torch.equal(old, new), name
 
 
 def test_it_happens_at_the_steps_that_the_settings_name(

@@ -98,7 +98,7 @@ def to_content(model: TrainedModel) -> FileContent:
     return FileContent(
         dimensions=Dimensions(
             coupled_primitives=m.coupled_primitives,
-            reference_dim=m.reference_dim,
+            reference_dim=model.reference_dim,
             residual_dim=m.residual_dim,
             reference_hyper_dim=e.reference_hyper_dim,
             residual_hyper_dim=e.residual_hyper_dim,

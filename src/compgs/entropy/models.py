@@ -18,7 +18,7 @@ from compgs.entropy.conditional import code_latents
 from compgs.entropy.factorized import FactorizedDensity
 from compgs.entropy.network import NEGATIVE_SLOPE, OCTAVE, UNIT_SCALE, EntropyNetwork
 from compgs.entropy.quantization import round_straight_through
-from compgs.linear import linear
+from compgs.linear import Reader, linear
 
 STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")
 
@@ -108,15 +108,17 @@ class EntropyModel(nn.Module):
         network.biases[-1][:channels] = float(values.mean()) / (step * network.gain[0])
         network.biases[-1][channels:] = (max(float(values.std(ddof=1)), 0.1) / step).log2()
 
-    def along_references(self) -> Iterator[tuple[Tensor, int, int]]:
-        """Parameters with a dimension along the references' channels: that dimension, and where these begin in it."""
-        yield self.reference_analysis.first.weight, 1, 0
-        yield self.reference_network.weights[-1], 0, 0  # rows of the means; those of the scales follow them
-        yield self.reference_network.biases[-1], 0, 0
-        yield self.covariance_network.weights[0], 1, 0
-        if self.own_residuals:
-            hyper = self.residual_network.weights[0].shape[1] - self.reference_network.channels
-            yield self.residual_network.weights[0], 1, hyper
+    def readers(self) -> Iterator[Reader]:
+        """The layers that take the references."""
+        analysis, covariance, residual = (
+            self.reference_analysis.first,
+            self.covariance_network,
+            self.residual_network,
+        )
+        hyper = residual.weights[0].shape[1] - self.reference_network.channels
+        yield Reader(analysis.weight, analysis.bias, 1, 0, 1.0)
+        yield Reader(covariance.weights[0], covariance.biases[0], 1, 0, 1.0)
+        yield Reader(residual.weights[0], residual.biases[0], 1, hyper, 1.0)
 
     @torch.no_grad()
     def restart_reference_scales(self, references: Tensor) -> tuple[nn.Parameter, nn.Parameter]:

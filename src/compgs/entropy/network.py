@@ -56,6 +56,12 @@ class EntropyNetwork(nn.Module):
         self.register_buffer("gain", gain)
         self.register_buffer("offset", offset)
 
+    def keep_channels(self, kept: Tensor) -> None:
+        """Follow the last layer's weights and biases, which have lost the rows of all channels but those `kept` [C]."""
+        both = kept.repeat(2).to(self.gain.device)
+        self.gain, self.offset = self.gain[both], self.offset[both]
+        self.channels = int(kept.sum())
+
     def layers(self, bits: int | None = None) -> list[tuple[Tensor, Tensor]]:
         """Effective (weight [out, in], bias [out]) of each layer; rounded to `bits` bits if given."""
         result = []

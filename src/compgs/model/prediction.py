@@ -11,7 +11,7 @@ Opacity is predicted first: a coupled primitive that is not seen needs nothing e
 
 import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
+from compgs.linear import Reader
 from compgs.model.fused import PairedPrediction
 from compgs.model.layers import ResidualMLP
 from compgs.model.primitives import Primitives
@@ -55,6 +56,17 @@ class PredictionHeads(nn.Module):
         network.skip_weight[:3] = 0
         network.skip_weight[:3, first : first + 3] = torch.eye(3)
         network.output_bias[first : first + 3] = mean
+
+    def readers(self, reference_step: float) -> Iterator[Reader]:
+        """The layers that take the references."""
+        for network in self.networks():
+            yield Reader(network.input_weight, network.input_bias, 0, 0, reference_step)
+            yield Reader(network.skip_weight, network.output_bias, 0, 0, reference_step)
+
+    def networks(self) -> Iterator[ResidualMLP]:
+        for network in self.children():
+            assert isinstance(network, ResidualMLP)
+            yield network
 
     def forward(self, kind: str, *args: Any) -> Any:
         """`predict_appearance`, `predict_color` and so on, by name, so that torch.func.functional_call reaches them."""

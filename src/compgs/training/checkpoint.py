@@ -18,6 +18,7 @@ from compgs.config import Config, config_from_dict
 from compgs.errors import CheckpointError, OutputError
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
+from compgs.training.decorrelation import keep_channels
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 CHECKPOINT_VERSION = "1"
@@ -85,6 +86,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
         scene["distance_unit"],
         tuple(scene["background"]),
     )
+    channels = parts["model"]["references"].shape[1]
+    keep_channels(model, torch.arange(model.reference_dim) < channels)
     model.load_state_dict(parts["model"])
     return Checkpoint(model, parts["optimizer"], parts["extra"], json.loads(metadata["state"]))
 

@@ -160,7 +160,7 @@ class AdaptiveControl:
             first.scatter_reduce_(0, inverse, torch.arange(len(key), device=key.device), "amin")
             chosen = cells[first] * size
             parents = model.references.detach()[slots // m.coupled_primitives]
-            references = parents.new_full((len(unique), m.reference_dim), -torch.inf)
+            references = parents.new_full((len(unique), model.reference_dim), -torch.inf)
             references.scatter_reduce_(0, inverse[:, None].expand_as(parents), parents, "amax")
             grown["coordinates"].append(chosen[:room])
             grown["references"].append(references[:room])
@@ -170,7 +170,7 @@ class AdaptiveControl:
         new = sum(len(x) for x in grown["coordinates"])
         empty = {
             "coordinates": (0, 3),
-            "references": (0, m.reference_dim),
+            "references": (0, model.reference_dim),
             "log_scales": (0, 6),
         }
         rows = {name: torch.cat([*parts, means.new_zeros(empty[name])]) for name, parts in grown.items()}

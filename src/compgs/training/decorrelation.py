@@ -10,7 +10,13 @@ is the same scene, with rounding errors of the same size. Of all U the principal
 Karhunen-Loeve transform; Goyal 2001, "Theoretical foundations of transform coding") leave Gaussian channels the least
 bits, and the file needs nothing new: the weights that it holds anyway absorb U. Anchors still move and come, so that it
 is done several times in a run.
+
+Adam moves all channels alike. Where the first axes hold most of what there is to say, and the last ones hardly leave
+zero, those would learn too slowly and these wander for nothing: learning rates follow the spread of the channels.
 """
+
+from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import torch
@@ -18,6 +24,13 @@ from torch import Tensor
 
 from compgs.linear import transposed_product
 from compgs.trained_model import TrainedModel
+from compgs.training.optimizers import replace_parameter
+
+# Learning rate of a channel that spreads over one step; it goes with the root of the spread, down to the second number.
+# Rates a seventh higher and lower came out alike (docs/results/experiments.md, sixth series).
+RATE_OF_ONE, SMALLEST_RATE = 1.75, 0.6
+# Spread in steps below which a channel is dropped: one symbol in ten is other than zero there. 0.25 and 0.35 came out alike.
+SILENT = 0.3
 
 
 @torch.no_grad()
@@ -35,25 +48,88 @@ def principal_axes(references: Tensor) -> Tensor:
 
 
 @torch.no_grad()
+def channel_rates(references: Tensor) -> Tensor:
+    """[C] learning rates of the channels of references [N, C], in quantization steps, as multiples of their group's."""
+    # numpy's sums do not depend on the number of threads
+    spread = references.double().cpu().numpy().std(0)
+    return torch.from_numpy(np.maximum(RATE_OF_ONE * np.sqrt(spread), SMALLEST_RATE)).to(references)
+
+
+@torch.no_grad()
 def decorrelate(model: TrainedModel, optimizer: torch.optim.Optimizer) -> None:
     """Turn the references into their principal axes, and with them all that reads them and Adam's moments."""
     if not torch.isfinite(model.references).all():
         return  # the run has diverged, and the next step will say so
     axes = principal_axes(model.references)
-    for parameter, dimension, first in model.along_references():
-        _turn(parameter, dimension, first, axes)
+    for parameter, dimension, first in _along_references(model):
+        _turn(parameter.data, dimension, first, axes)
         state = optimizer.state.get(parameter, {})
         if "exp_avg" in state:
             _turn(state["exp_avg"], dimension, first, axes)
-            # Of uncorrelated gradients, the only ones of which these alone would be enough.
+            # As if gradients of different channels had nothing in common: more than the squares is not known.
             _turn(state["exp_avg_sq"], dimension, first, axes.square())
     for parameter in model.entropy.restart_reference_scales(model.references):
         state = optimizer.state.get(parameter, {})
         if "exp_avg" in state:
-            state["exp_avg"][model.config.model.reference_dim :] = 0
+            state["exp_avg"][model.reference_dim :] = 0
+
+
+@torch.no_grad()
+def drop_silent_channels(model: TrainedModel, optimizer: torch.optim.Optimizer) -> None:
+    """Remove the channels that hardly say anything: symbols, and the weights of all that reads them, cost bytes. What
+    they are on average goes into biases.
+    """
+    spread = model.references.double().cpu().numpy().std(0)
+    kept = torch.from_numpy(spread >= min(SILENT, spread.max()))
+    silent = torch.nonzero(~kept.to(model.device)).view(-1)
+    average = model.references.index_select(1, silent).mean(0)
+    for reader in model.readers():
+        columns = reader.weight.movedim(reader.dimension, -1)[..., reader.first + silent]
+        reader.bias.add_(columns @ (average * reader.unit))
+    keep_channels(model, kept, optimizer)
+
+
+@torch.no_grad()
+def keep_channels(
+    model: TrainedModel,
+    kept: Tensor,  # [reference_dim] bool
+    optimizer: torch.optim.Optimizer | None = None,
+) -> None:
+    """The same model without the other channels of its references, and Adam's moments without them."""
+    network = model.entropy.reference_network
+    both = kept.repeat(2)  # means and scales
+    changes = [
+        (model.references, 1, 0, kept),
+        (network.weights[-1], 0, 0, both),
+        (network.biases[-1], 0, 0, both),
+        *((reader.weight, reader.dimension, reader.first, kept) for reader in model.readers()),
+    ]
+    for parameter, dimension, first, entries in changes:
+        change = partial(_narrowed, dimension=dimension, first=first, kept=entries)
+        replace_parameter(model, optimizer, parameter, change)
+    network.keep_channels(kept)
+    for head in model.heads.networks():
+        head.anchor_dim -= len(kept) - model.reference_dim
+
+
+def _along_references(model: TrainedModel) -> Iterator[tuple[Tensor, int, int]]:
+    """Parameters with a dimension along the references' channels: that dimension, and where these begin in it."""
+    network = model.entropy.reference_network
+    yield model.references, 1, 0
+    yield network.weights[-1], 0, 0  # rows of the means; those of the scales come after them
+    yield network.biases[-1], 0, 0
+    for reader in model.readers():
+        yield reader.weight, reader.dimension, reader.first
 
 
 def _turn(x: Tensor, dimension: int, first: int, matrix: Tensor) -> None:
     """x <- x times matrix [C, C] along `dimension`, of which the C entries from `first` on are meant."""
     part = x.narrow(dimension, first, len(matrix))
     part.copy_((part.movedim(dimension, -1) @ matrix).movedim(-1, dimension))
+
+
+def _narrowed(x: Tensor, dimension: int, first: int, kept: Tensor) -> Tensor:
+    """x without those of the C entries from `first` on along `dimension` that are not `kept` [C]."""
+    all_kept = torch.ones(x.shape[dimension], dtype=torch.bool)
+    all_kept[first : first + len(kept)] = kept
+    return x.index_select(dimension, torch.nonzero(all_kept).view(-1).to(x.device))

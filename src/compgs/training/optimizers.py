@@ -162,3 +162,29 @@ def replace_rows(
             for moment in ("exp_avg", "exp_avg_sq"):
                 state[moment] = torch.cat([state[moment][kept], torch.zeros_like(added[name])])
             optimizer.state[new] = state
+
+
+@torch.no_grad()
+def replace_parameter(
+    model: nn.Module,
+    optimizer: torch.optim.Optimizer | None,
+    old: Tensor,
+    change: Callable[[Tensor], Tensor],
+) -> None:
+    """Another shape for a parameter, by `change`, in its module and in the optimizer, Adam's moments included.
+
+    It is another parameter afterwards: graphs of earlier steps remember the old one's shape.
+    """
+    name = next(name for name, p in model.named_parameters() if p is old)
+    path, _, attribute = name.rpartition(".")
+    new = nn.Parameter(change(old.detach()), requires_grad=old.requires_grad)
+    setattr(model.get_submodule(path), attribute, new)
+    if optimizer is None:
+        return
+    for group in optimizer.param_groups:
+        group["params"] = [new if p is old else p for p in group["params"]]
+    state = optimizer.state.pop(old, None)
+    if state:
+        for moment in ("exp_avg", "exp_avg_sq"):
+            state[moment] = change(state[moment])
+        optimizer.state[new] = state

@@ -37,7 +37,7 @@ from compgs.training.checkpoint import (
     save_checkpoint,
 )
 from compgs.training.control import AdaptiveControl, make_schedule, rate_weight
-from compgs.training.decorrelation import decorrelate
+from compgs.training.decorrelation import channel_rates, decorrelate, drop_silent_channels
 from compgs.training.dropout import share_left_out, thinned
 from compgs.training.initial import initial_model
 from compgs.training.loop import (
@@ -115,6 +115,7 @@ class Trainer:
         self.chance = torch.Generator(device).manual_seed(config.training.seed + 1)  # of growth
         self.shuffle = np.random.default_rng(config.training.seed + 2)
         self.noise = UniformNoise(config.training.seed + 3, self.shuffle, device)
+        self.reference_rates: Tensor | None = None  # [reference_dim], once the channels differ in it
         self.order: list[int] = []
         self.targets: dict[int, Target] = {}
         self.settings = RasterSettings(background=scene.background)
@@ -182,9 +183,7 @@ class Trainer:
         profile.lap("entropy, backward")
 
         set_learning_rates(self.optimizer, progress, DECAYS[t.schedule], t.head_warm_up)
-        if t.sparse_adam:
-            step_rows(self.model, self.optimizer, rows)
-        self.optimizer.step()
+        self.optimizer_step(rows)
         self.optimizer.zero_grad(set_to_none=True)
         if not self.config.model.residuals:
             self.model.share_residuals()
@@ -196,6 +195,16 @@ class Trainer:
             profile.lap("control")
         self.finish_step()
         return StepResult(loss.detach(), rendered.image.detach(), view)
+
+    def optimizer_step(self, rows: Tensor) -> None:
+        """Adam's step, after a view of the anchors in `rows`; each channel of the references by its own rate."""
+        references, rates = self.model.references.detach(), self.reference_rates
+        before = references.clone() if rates is not None else references
+        if self.config.training.sparse_adam:
+            step_rows(self.model, self.optimizer, rows)
+        self.optimizer.step()
+        if rates is not None:
+            references.copy_(before.lerp_(references, rates))
 
     def revival(self, prediction: Prediction) -> Tensor | float:
         """The loss that keeps a scene of which hardly anything is drawn from vanishing; 0 otherwise."""
@@ -216,6 +225,9 @@ class Trainer:
             self.profile.lap("control")
         if self.step in self.decorrelated_at:
             decorrelate(self.model, self.optimizer)
+            if self.step == max(self.decorrelated_at):
+                drop_silent_channels(self.model, self.optimizer)
+            self.reference_rates = channel_rates(self.model.references)
             self.profile.lap("control")
         self.profile.end()
         self.step += 1
@@ -261,7 +273,7 @@ class Trainer:
         }
         return {
             "reference_hyper": e.reference_hyper_dim,
-            "reference": m.reference_dim,
+            "reference": self.model.reference_dim,
             "covariance": 6,
             **(own if m.residuals else {}),
         }
@@ -394,6 +406,8 @@ class Trainer:
     def save(self, path: Path) -> None:
         extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
         extra["chance"] = self.chance.get_state()
+        if self.reference_rates is not None:
+            extra["reference_rates"] = self.reference_rates
         state = {
             "step": self.step,
             "order": self.order,
@@ -413,6 +427,8 @@ class Trainer:
         restore_optimizer(trainer.model, trainer.optimizer, checkpoint.optimizer)
         for name in AdaptiveControl.STATISTICS:
             setattr(trainer.control, name, checkpoint.extra[f"control/{name}"].to(device))
+        if "reference_rates" in checkpoint.extra:
+            trainer.reference_rates = checkpoint.extra["reference_rates"].to(device)
         trainer.chance.set_state(checkpoint.extra["chance"])
         trainer.shuffle.bit_generator.state = checkpoint.state["shuffle"]
         trainer.order = checkpoint.state["order"]
