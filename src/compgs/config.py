@@ -53,7 +53,8 @@ class EntropyConfig:
     covariance_step: float = (
         0.15  # initial learned step of the anchors' log scales (0.01 in Sec. 3.4: bits for what nobody sees)
     )
-    # of the steps: references are turned into their principal axes (not in the paper)
+    # of the steps: references are turned into their principal axes, at the last of them channels that hardly say
+    # anything are dropped (not in the paper)
     decorrelate_at: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
     quantized: bool = True  # False: latents are trained unrounded, as a bound that no file reaches (ablation)
     network_hidden: int = 0  # hidden width of the entropy networks; 0: one linear layer (Ref.)

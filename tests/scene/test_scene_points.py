@@ -114,6 +114,13 @@ def test_random_points_lie_where_cameras_look(count: int, radius: float, seed: i
     assert np.linalg.norm(np.median(positions, axis=0) - (1, 2, 3)) < radius
 
 
+def test_random_points_of_two_cameras_that_face_each_other_lie_between_them() -> None:
+    # Their axes are one line: nothing but their places says where on it to look.
+    for seed in range(20):
+        positions = fallback_points(ring(2, 0.25), 300, seed).positions
+        assert np.linalg.norm(positions.mean(axis=0) - (1, 2, 3)) < 0.25
+
+
 def test_random_points_depend_on_the_seed_alone() -> None:
     cameras = ring(5, 2.0)
     a, b, c = (fallback_points(cameras, 50, seed).positions for seed in (1, 1, 2))

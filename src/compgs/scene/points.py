@@ -89,11 +89,12 @@ def fallback_points(cameras: Sequence[Camera], count: int, seed: int = 0) -> Poi
 
 
 def _closest_to_axes(centers: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """[3] the point of least squared distance to the lines from centers [V, 3] along directions [V, 3]."""
-    across = (
-        np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    )  # projects onto the plane across the axis
-    # lstsq: parallel axes leave the position along them open
-    return np.linalg.lstsq(across.sum(axis=0), (across @ centers[:, :, None]).sum(axis=0)[:, 0], rcond=1e-6)[
-        0
-    ]
+    """[3] the point of least squared distance to the lines from centers [V, 3] along directions [V, 3]; where parallel
+    axes leave it open, of all such points the one that is nearest to the centers' mean.
+    """
+    # projects onto the plane across the axis
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    middle = centers.mean(axis=0)
+    offsets = across @ (centers - middle)[:, :, None]
+    # lstsq gives the smallest of all solutions: from the middle, not from wherever the world has its origin
+    return middle + np.linalg.lstsq(across.sum(axis=0), offsets.sum(axis=0)[:, 0], rcond=1e-6)[0]
