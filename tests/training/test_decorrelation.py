@@ -259,6 +259,17 @@ def test_it_happens_at_the_steps_that_the_settings_name(
     assert turned == [8, 20]
 
 
+def test_a_run_that_has_diverged_is_left_as_it_is(blob_scene: Scene, tiny_config: Config) -> None:
+    trainer = Trainer(blob_scene, tiny_config, CPU)
+    trainer.step = max(trainer.decorrelated_at)
+    with torch.no_grad():
+        trainer.model.references[0, 0] = float("nan")
+    before = trainer.model.references.detach().clone()
+    trainer.turn_references()
+    assert trainer.model.reference_dim == tiny_config.model.reference_dim
+    assert torch.equal(trainer.model.references.nan_to_num(), before.nan_to_num())
+
+
 def test_the_paper_preset_does_without() -> None:
     assert load_config("paper").entropy.decorrelate_at == ()
     assert load_config().entropy.decorrelate_at

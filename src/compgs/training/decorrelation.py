@@ -51,16 +51,14 @@ def principal_axes(references: Tensor) -> Tensor:
 @torch.no_grad()
 def channel_rates(references: Tensor) -> Tensor:
     """[C] learning rates of the channels of references [N, C], in quantization steps, as multiples of their group's."""
-    # numpy's sums do not depend on the number of threads
-    spread = references.double().cpu().numpy().std(0)
-    return torch.from_numpy(np.maximum(RATE_OF_ONE * np.sqrt(spread), SMALLEST_RATE)).to(references)
+    return torch.from_numpy(np.maximum(RATE_OF_ONE * np.sqrt(_spread(references)), SMALLEST_RATE)).to(
+        references
+    )
 
 
 @torch.no_grad()
 def decorrelate(model: TrainedModel, optimizer: torch.optim.Optimizer) -> None:
     """Turn the references into their principal axes, and with them all that reads them and Adam's moments."""
-    if not torch.isfinite(model.references).all():
-        return  # the run has diverged, and the next step will say so
     axes = principal_axes(model.references)
     for parameter, dimension, first in _along_references(model):
         _turn(parameter.data, dimension, first, axes)
@@ -80,7 +78,7 @@ def drop_silent_channels(model: TrainedModel, optimizer: torch.optim.Optimizer) 
     """Remove the channels that hardly say anything: symbols, and the weights of all that reads them, cost bytes. What
     they are on average goes into biases.
     """
-    spread = model.references.double().cpu().numpy().std(0)
+    spread = _spread(model.references)
     kept = torch.from_numpy(spread >= min(SILENT, spread.max()))
     silent = torch.nonzero(~kept.to(model.device)).view(-1)
     average = model.references.index_select(1, silent).mean(0)
@@ -111,6 +109,12 @@ def keep_channels(
     network.keep_channels(kept)
     for head in model.heads.networks():
         head.anchor_dim -= len(kept) - model.reference_dim
+
+
+def _spread(references: Tensor) -> np.ndarray:
+    """[C] standard deviations of the channels of references [N, C]."""
+    # numpy's sums do not depend on the number of threads
+    return references.double().cpu().numpy().std(0)
 
 
 def _along_references(model: TrainedModel) -> Iterator[tuple[Tensor, int, int]]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 import torch
@@ -151,17 +152,14 @@ def replace_rows(
     model.coordinates = torch.cat([model.coordinates[kept], added["coordinates"]])
     model.mask = torch.cat([model.mask[kept], added["mask"]])
     for name in model.anchor_parameters:
-        old = getattr(model, name)
-        new = nn.Parameter(torch.cat([old.detach()[kept], added[name]]))
-        setattr(model, name, new)
-        for group in optimizer.param_groups:
-            if group["name"] == name:
-                group["params"] = [new]
-        state = optimizer.state.pop(old, None)
-        if state:
-            for moment in ("exp_avg", "exp_avg_sq"):
-                state[moment] = torch.cat([state[moment][kept], torch.zeros_like(added[name])])
-            optimizer.state[new] = state
+        rows = added[name]
+        change = partial(_joined, kept=kept, rows=rows)
+        change_moment = partial(_joined, kept=kept, rows=torch.zeros_like(rows))
+        replace_parameter(model, optimizer, getattr(model, name), change, change_moment)
+
+
+def _joined(x: Tensor, kept: Tensor, rows: Tensor) -> Tensor:
+    return torch.cat([x[kept], rows])
 
 
 @torch.no_grad()
@@ -170,8 +168,10 @@ def replace_parameter(
     optimizer: torch.optim.Optimizer | None,
     old: Tensor,
     change: Callable[[Tensor], Tensor],
+    change_moment: Callable[[Tensor], Tensor] | None = None,
 ) -> None:
-    """Another shape for a parameter, by `change`, in its module and in the optimizer, Adam's moments included.
+    """Another shape for a parameter, by `change`, in its module and in the optimizer, Adam's moments included (these by
+    `change_moment`, if given).
 
     It is another parameter afterwards: graphs of earlier steps remember the old one's shape.
     """
@@ -186,5 +186,5 @@ def replace_parameter(
     state = optimizer.state.pop(old, None)
     if state:
         for moment in ("exp_avg", "exp_avg_sq"):
-            state[moment] = change(state[moment])
+            state[moment] = (change_moment or change)(state[moment])
         optimizer.state[new] = state

@@ -224,14 +224,20 @@ class Trainer:
             self.prune()
             self.profile.lap("control")
         if self.step in self.decorrelated_at:
-            decorrelate(self.model, self.optimizer)
-            if self.step == max(self.decorrelated_at):
-                drop_silent_channels(self.model, self.optimizer)
-            self.reference_rates = channel_rates(self.model.references)
+            self.turn_references()
             self.profile.lap("control")
         self.profile.end()
         self.step += 1
         self.control_rate()
+
+    def turn_references(self) -> None:
+        """Into their principal axes, for the last time without the channels that hardly say anything."""
+        if not torch.isfinite(self.model.references).all():
+            return  # the run has diverged, and the next step will say so
+        decorrelate(self.model, self.optimizer)
+        if self.step == max(self.decorrelated_at):
+            drop_silent_channels(self.model, self.optimizer)
+        self.reference_rates = channel_rates(self.model.references)
 
     def skip(self, view: View) -> StepResult:
         """A step on a view that no anchor is in: nothing can be learned from it."""
