@@ -1,14 +1,55 @@
 """Made-up but plausible file contents: for the codec's tests, golden files and benchmark."""
 
+from typing import Literal
+
 import numpy as np
 
-from compgs.codec.content import Dimensions, FileContent, fixed_point, reconstruct, residual_context
-from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork, entropy_parameters
+from compgs.codec.content import (
+    LOG_SCALES,
+    Dimensions,
+    FileContent,
+    Group,
+    GroupShape,
+    Role,
+    conditional_tables,
+    coordinate_context,
+    fixed_point,
+    reconstruct,
+)
+from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork
 from compgs.codec.tables import hyper_tables
 from compgs.codec.weights import QuantizedTensor
 
 WEIGHT_SHIFT = 10
 RANDOM_ROWS = 16384
+
+
+def paper_groups(
+    reference: int = 32, residual: int = 8, reference_hyper: int = 4, residual_hyper: int = 10
+) -> tuple[GroupShape, ...]:
+    """The paper's chain (Sec. 3.3), by numbers of channels; residual 0: all anchors share their residual embeddings."""
+    chain = (
+        GroupShape(Role.SIDE, reference_hyper),
+        GroupShape(Role.REFERENCE, reference, (1.0,), (0,)),
+        GroupShape(Role.LOG_SCALES, LOG_SCALES, (0.0625,), (1,)),
+    )
+    if residual == 0:
+        return chain
+    own = GroupShape(Role.SIDE, residual_hyper), GroupShape(Role.RESIDUAL, residual, (1.0,), (1, 3))
+    return (*chain, *own)
+
+
+def make_dimensions(
+    coupled_primitives: int = 10,
+    groups: tuple[GroupShape, ...] | None = None,
+    heads: Literal["separate", "paired"] = "paired",
+    width: int = 32,
+    residual_dim: int = 8,
+) -> Dimensions:
+    """The paper's, but for what is given. `residual_dim` counts only without a group of residuals."""
+    groups = paper_groups() if groups is None else groups
+    coded = sum(g.channels for g in groups if g.role == Role.RESIDUAL)
+    return Dimensions(coupled_primitives, coded or residual_dim, heads, width, groups)
 
 
 def make_content(
@@ -17,57 +58,65 @@ def make_content(
     dimensions: Dimensions | None = None,
     *,
     kept: float = 0.8,  # share of coupled primitives that exist
-    hidden: int = 0,  # width of the entropy networks' hidden layer; 0: none
+    blocks: int = 0,  # residual blocks of the entropy networks; 0: one linear layer
+    hidden: int = 8,  # width of their hidden layers
     symbols: bool = True,  # False: zero symbols, and networks that are sure of it
 ) -> FileContent:
     """Content whose symbols follow its own networks' predictions, as a trained model's do."""
-    d = dimensions or Dimensions()
+    d = dimensions or make_dimensions()
     rng = np.random.default_rng(seed)
-    networks = {name: _network(rng, *size, hidden, symbols) for name, size in d.network_sizes().items()}
-
-    def hyper(channels: int) -> np.ndarray:
-        spread = np.linspace(0.5, 6.0, channels)
-        return np.rint(rng.standard_normal((anchors, channels)) * spread * symbols).astype(np.int32)
-
-    def draw(name: str, context: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        means, index = entropy_parameters(networks[name], context)
-        drawn = np.zeros(index.shape, np.int32)
-        for start in range(0, anchors if symbols else 0, RANDOM_ROWS):
-            scales = np.exp2(index[start : start + RANDOM_ROWS] / np.float32(12) - np.float32(5))
-            noise = rng.standard_normal(scales.shape, np.float32)
-            drawn[start : start + RANDOM_ROWS] = np.rint(noise * scales)
-        return drawn, means
-
-    z_f, z_g = hyper(d.reference_hyper_dim), hyper(d.residual_hyper_dim)
-    q_f, means = draw("reference", fixed_point(z_f))
-    f_hat = reconstruct(q_f, means)
-    q_c, _ = draw("covariance", f_hat)
-    q_g, _ = draw("residual", residual_context(z_g, f_hat))
+    coordinates = make_coordinates(anchors, rng)
     mask = rng.random((anchors, d.coupled_primitives)) < kept
-    residual = q_g.reshape(anchors, d.coupled_primitives, d.residual_dim)
-    residual *= mask[:, :, None]
-    flat = np.full((64, 49), 1.0 / 49)
+    # Symbols of all slots are drawn; a mask of ones here keeps the draw apart from the mask.
+    everything = np.ones_like(mask)
+    places = coordinate_context(coordinates)
+    latents: list[np.ndarray] = []
+    groups = []
+    for shape in d.groups:
+        rows = anchors * (d.coupled_primitives if shape.role == Role.RESIDUAL else 1)
+        if shape.has_network:
+            prior: IntegerNetwork | tuple = _network(rng, *d.network_size(shape), blocks, hidden, symbols)
+            means, index, _ = conditional_tables(shape, prior, latents, places, everything)
+            drawn = _draw(rng, index, symbols)
+            latents.append(reconstruct(drawn, means))
+        else:
+            spread = np.linspace(0.5, 6.0, shape.channels)
+            drawn = np.rint(rng.standard_normal((rows, shape.channels)) * spread * symbols).astype(np.int32)
+            prior = hyper_tables(
+                np.full((shape.width(d.coupled_primitives), 49), 1.0 / 49), _by_table(drawn, anchors)
+            )
+            latents.append(fixed_point(drawn))
+        if shape.role == Role.RESIDUAL:
+            drawn = drawn.reshape(anchors, d.coupled_primitives, shape.channels) * mask[:, :, None]
+        groups.append(Group(shape, prior, drawn))
     return FileContent(
-        dimensions=d,
+        coupled_primitives=d.coupled_primitives,
+        residual_dim=d.residual_dim,
+        heads_layout=d.heads,
+        width=d.width,
         voxel_size=0.015625,
+        world_offset=(0.0, 0.0, 0.0),
         view_distance_scale=3.0,
         background=(0.0, 0.5, 1.0),
-        reference_step=1.0,
-        residual_step=1.0,
-        covariance_step=0.0625,
-        coordinates=make_coordinates(anchors, rng),
+        coordinates=coordinates,
         mask=mask,
-        reference_hyper=z_f,
-        reference=q_f,
-        covariance=q_c,
-        residual_hyper=z_g,
-        residual=residual,
-        reference_hyper_tables=hyper_tables(flat[: d.reference_hyper_dim], z_f),
-        residual_hyper_tables=hyper_tables(flat[: d.residual_hyper_dim], z_g),
-        networks=networks,
+        groups=tuple(groups),
         heads=_heads(rng, d),
         metadata={"creator": "made up"},
     )
+
+
+def _by_table(symbols: np.ndarray, anchors: int) -> np.ndarray:
+    return symbols.reshape(anchors, -1)
+
+
+def _draw(rng: np.random.Generator, index: np.ndarray, symbols: bool) -> np.ndarray:
+    drawn = np.zeros(index.shape, np.int32)
+    for start in range(0, len(index) if symbols else 0, RANDOM_ROWS):
+        scales = np.exp2(index[start : start + RANDOM_ROWS] / np.float32(12) - np.float32(5))
+        noise = rng.standard_normal(scales.shape, np.float32)
+        drawn[start : start + RANDOM_ROWS] = np.rint(noise * scales)
+    return drawn
 
 
 def make_coordinates(anchors: int, rng: np.random.Generator) -> np.ndarray:  # [N, 3] int32
@@ -84,28 +133,33 @@ def make_coordinates(anchors: int, rng: np.random.Generator) -> np.ndarray:  # [
 
 
 def _network(
-    rng: np.random.Generator, inputs: int, outputs: int, hidden: int, spread: bool
+    rng: np.random.Generator, inputs: int, outputs: int, blocks: int, hidden: int, spread: bool
 ) -> IntegerNetwork:
     """Means within a few steps, scales between a quarter of a step and a few steps."""
     layers = []
-    if hidden:
-        weight = rng.standard_normal((hidden, inputs)) / np.sqrt(inputs)
-        layers.append(_layer(weight, np.zeros(hidden), rectify=True))
-        inputs = hidden
+    taken = inputs
+    for i in range(1 + 2 * blocks if blocks else 0):
+        n_in = inputs if i == 0 else hidden
+        weight = rng.standard_normal((hidden, n_in)) / np.sqrt(n_in)
+        layers.append(
+            _layer(weight, np.zeros(hidden), rectify=i % 2 == 1 or i == 0, adds=i % 2 == 0 and i > 0)
+        )
+        taken = hidden + inputs
     channels = outputs // 2
-    weight = rng.standard_normal((outputs, inputs)) / np.sqrt(inputs) * 0.3
+    weight = rng.standard_normal((outputs, taken)) / np.sqrt(taken) * 0.3
     bias = np.concatenate([rng.uniform(-1, 1, channels), rng.uniform(36, 72, channels) * spread])
     weight[channels:] *= spread
     layers.append(_layer(weight, bias, rectify=False))
-    return IntegerNetwork(tuple(layers))
+    return IntegerNetwork(tuple(layers), skip=blocks > 0)
 
 
-def _layer(weight: np.ndarray, bias: np.ndarray, *, rectify: bool) -> IntegerLayer:
+def _layer(weight: np.ndarray, bias: np.ndarray, *, rectify: bool, adds: bool = False) -> IntegerLayer:
     return IntegerLayer(
         weight=np.rint(weight * (1 << WEIGHT_SHIFT)).astype(np.int32),
         bias=np.rint(bias * (1 << FRACTION_BITS)).astype(np.int64),
         shift=WEIGHT_SHIFT,
         rectify=rectify,
+        adds=adds,
     )
 
 

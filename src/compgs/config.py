@@ -45,7 +45,6 @@ class EntropyConfig:
     """Quantization and rate (Sec. 3.3)."""
 
     reference_hyper_dim: int = 4  # hyperprior channels of a reference embedding (Ref.)
-    residual_hyper_dim: int = 10  # hyperprior channels of an anchor's K residual embeddings (Ref.)
     reference_step: float = (
         0.33  # quantization step of reference embeddings (1 in Sec. 3.4 costs 0.5 dB in short runs)
     )
@@ -57,7 +56,8 @@ class EntropyConfig:
     # anything are dropped (not in the paper)
     decorrelate_at: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
     quantized: bool = True  # False: latents are trained unrounded, as a bound that no file reaches (ablation)
-    network_hidden: int = 0  # hidden width of the entropy networks; 0: one linear layer (Ref.)
+    network_blocks: int = 0  # residual blocks of the entropy networks (two in Sec. 3.4); 0: one linear layer
+    network_width: int = 32  # of their hidden layers (Ref.)
     network_bits: int = (
         10  # of the entropy networks' weights in the file; the run trains with them so rounded
     )
@@ -112,7 +112,10 @@ class TrainingConfig:
     color_lr: tuple[float, float] = (8e-3, 8e-5)  # Ref.
     schedule: Literal["cosine", "exponential"] = "cosine"  # of all these rates (Sec. 4.1; Ref.: exponential)
     head_warm_up: float = 0.05  # of the steps in which the heads come up to their learning rates
-    entropy_lr: tuple[float, float] = (5e-3, 1e-4)  # Ref. 2e-4 -> 1e-5 hardly moves in short runs
+    entropy_lr: tuple[float, float] = (5e-3, 1e-4)  # of the entropy model (Ref.: 2e-4 -> 1e-5)
+    # steps for which entropy_lr is meant: a shorter run multiplies it by as much as it is shorter, so that the networks
+    # get as far; 0: as it is given
+    entropy_lr_steps: int = 0
     quantized_weights: float = (
         0.8  # of the steps before the networks' weights are trained as they will be stored
     )
@@ -218,7 +221,6 @@ def check_config(config: Config) -> None:
         ),
         ("model.max_anchors", 1 <= m.max_anchors <= 1 << 24, "1 to 16777216"),
         ("entropy.reference_hyper_dim", 1 <= e.reference_hyper_dim <= 64, "1 to 64"),
-        ("entropy.residual_hyper_dim", 1 <= e.residual_hyper_dim <= 64, "1 to 64"),
         ("entropy.reference_step", 0 < e.reference_step < 1e3, "above 0"),
         ("entropy.residual_step", 0 < e.residual_step < 1e3, "above 0"),
         ("entropy.covariance_step", 0 < e.covariance_step < 10, "above 0"),
@@ -231,7 +233,9 @@ def check_config(config: Config) -> None:
         ("training.rate", t.rate in ("bits", "elements"), "bits or elements"),
         ("training.rate_start", 0 <= t.rate_start <= 1, "0 to 1"),
         ("training.seed", 0 <= t.seed < 1 << 31, "0 to 2147483647"),
-        ("entropy.network_hidden", 0 <= e.network_hidden <= 1024, "0 to 1024"),
+        ("entropy.network_blocks", 0 <= e.network_blocks <= 3, "0 to 3"),
+        ("entropy.network_width", 1 <= e.network_width <= 1024, "1 to 1024"),
+        ("training.entropy_lr_steps", 0 <= t.entropy_lr_steps <= 10_000_000, "0 to 10000000"),
         ("training.ssim_weight", 0 <= t.ssim_weight <= 1, "0 to 1"),
         ("training.scale_weight", 0 <= t.scale_weight < 1e6, "0 or more"),
         ("training.quantized_weights", 0 <= t.quantized_weights <= 1, "0 to 1"),

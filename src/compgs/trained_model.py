@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from compgs.config import Config
-from compgs.entropy.models import EntropyModel, Quantized
+from compgs.entropy.models import EntropyModel, Quantized, starting_residuals
 from compgs.entropy.quantization import quantize_weight
 from compgs.linear import Reader
 from compgs.model.hybrid_model import HybridModel
@@ -19,6 +19,8 @@ from compgs.model.primitives import Primitives, every_slot
 
 # Biases are few: they keep more bits than the weights.
 BIAS_BITS = 14
+# Residual embeddings that all anchors share are few, too.
+SHARED_RESIDUAL_BITS = 10
 
 
 class TrainedModel(nn.Module):
@@ -53,9 +55,7 @@ class TrainedModel(nn.Module):
         self.log_scales = nn.Parameter(torch.zeros(n, 6))
         self.references = nn.Parameter(torch.zeros(n, m.reference_dim))
         # Without residual embeddings of their own, all anchors have the one row that there is.
-        self.residuals = nn.Parameter(self.entropy.starting_residuals().repeat(n if m.residuals else 1, 1))
-        if not m.residuals:
-            self.entropy.expect_constant_residuals()
+        self.residuals = nn.Parameter(starting_residuals(self.entropy, m).repeat(n if m.residuals else 1, 1))
 
     @property
     def anchors(self) -> int:
@@ -85,10 +85,10 @@ class TrainedModel(nn.Module):
         yield from self.heads.readers(self.config.entropy.reference_step)
         yield from self.entropy.readers()
 
-    def share_residuals(self) -> None:
-        """The file has the residuals that all anchors share as what it expects: no symbol is other than zero."""
-        with torch.no_grad():
-            self.entropy.residual_network.biases[-1][: self.residuals.shape[1]] = self.residuals[0]
+    def shared_residuals(self) -> Tensor:
+        """[K, residual_dim] residual embeddings, where all anchors share them."""
+        m, e = self.config.model, self.config.entropy
+        return (self.residuals * e.residual_step).view(m.coupled_primitives, m.residual_dim)
 
     def quantized(
         self,
@@ -112,7 +112,12 @@ class TrainedModel(nn.Module):
             chosen(self.references),
             chosen(self.log_scales) / self.entropy.covariance_step,
         )
-        residuals = chosen(self.residuals) if self.config.model.residuals else self.residuals
+        residuals: Tensor = self.residuals
+        if self.config.model.residuals:
+            residuals = chosen(residuals)
+        elif stored_weights:
+            stored = quantize_weight(self.shared_residuals(), SHARED_RESIDUAL_BITS)
+            residuals = stored.view_as(residuals) / e.residual_step
         latents = self.entropy(
             references,
             covariances,

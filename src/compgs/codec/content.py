@@ -1,92 +1,155 @@
 """What a file holds, as integers: between the trained model (floats, torch) and the bytes.
 
 "Q12" is fixed point with 12 fractional bits. A latent is in units of its quantization step; a symbol is the
-whole number of steps between a latent and the mean that the entropy networks predict for it. Rows are
-anchors.
+whole number of steps between a latent and the mean that is predicted for it. Rows are anchors.
 
-    z_f ─► reference network ─► mean, scale of f;   f_hat = q_f + mean          (CompGS Sec. 3.3, Fig. 4)
-    f_hat ─► covariance network ─► mean, scale of c;   c_hat = q_c + mean
-    z_g, f_hat ─► residual network ─► mean, scale of g;   g_hat = q_g + mean
+Latents come in *groups*, a causal chain: the symbols of a group are coded either by tables, one a channel, or around
+means and scales that a network predicts from groups before it. The paper's entropy model (CompGS Sec. 3.3, Fig. 4) is
+
+    0 side       z_f   tables
+    1 reference  f     network of z_f           f_hat = q_f + mean
+    2 log scales c     network of f_hat         c_hat = q_c + mean
+    3 side       z_g   tables
+    4 residual   g     network of f_hat, z_g    g_hat = q_g + mean
+
+and other chains (several groups of one role, each given the one before; the anchors' coordinates as context) are
+written in the same format.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import IntEnum
 from typing import Literal
 
 import numpy as np
 from numba import njit, prange
 
+from compgs.codec.anchor_order import octree_depth, octree_origin
 from compgs.codec.integer_network import FRACTION_BITS, IntegerNetwork, entropy_parameters, first_rows
 from compgs.codec.rans import escape_bits
 from compgs.codec.tables import FrequencyTables, HyperTable, channel_tables, gaussian_tables
+from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 
-COVARIANCE_DIM = 6  # log scales of an anchor
-STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")  # in decoding order
+LOG_SCALES = 6  # of an anchor: reach of the offsets, size of the primitives
+COORDINATES = 3  # inputs of a network that sees where its anchor is
+
+
+class Role(IntEnum):
+    """What a group's latents are; the numbers are the file's."""
+
+    SIDE = 0  # context for other groups, nothing else: a hyperprior
+    REFERENCE = 1  # reference embedding of an anchor
+    LOG_SCALES = 2  # of an anchor
+    RESIDUAL = 3  # residual embedding of each coupled primitive that exists
+
+
+@dataclass(frozen=True)
+class GroupShape:
+    """A group as the scene section describes it."""
+
+    role: Role
+    channels: int  # of an anchor; with RESIDUAL of a coupled primitive
+    steps: tuple[float, ...] = ()  # quantization steps, float32: one, or one a channel; none with SIDE
+    context: tuple[int, ...] = ()  # groups before this one, ascending, that its network takes
+    sees_coordinates: bool = False  # whether the network takes the anchor's coordinates, before all else
+
+    @property
+    def has_network(self) -> bool:
+        """Else its channels have tables."""
+        return bool(self.context) or self.sees_coordinates
+
+    def width(self, coupled_primitives: int) -> int:
+        """Symbols of an anchor that has all its coupled primitives."""
+        return self.channels * (coupled_primitives if self.role == Role.RESIDUAL else 1)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Latents of all anchors, and what their symbols are coded with."""
+
+    shape: GroupShape
+    prior: IntegerNetwork | tuple[HyperTable, ...]  # tables: one a channel
+    symbols: np.ndarray  # [N, channels] int32; with RESIDUAL [N, K, channels], zero where the mask is False
 
 
 @dataclass(frozen=True)
 class Dimensions:
-    """Channels of everything."""
+    """Sizes of everything."""
 
-    coupled_primitives: int = 10  # K, slots per anchor; the mask says which exist
-    reference_dim: int = 32
-    residual_dim: int = 8
-    reference_hyper_dim: int = 4
-    residual_hyper_dim: int = 10
-    heads: Literal["separate", "paired"] = "paired"  # layout of the prediction networks
-    width: int = 32  # hidden width of the prediction networks
+    coupled_primitives: int  # K, slots per anchor; the mask says which exist
+    residual_dim: int  # channels of a residual embedding, whether coded or in the heads
+    heads: Literal["separate", "paired"]  # layout of the prediction networks
+    width: int  # hidden width of the prediction networks
+    groups: tuple[GroupShape, ...]
 
-    def network_sizes(self) -> dict[str, tuple[int, int]]:
-        """(inputs, outputs) of each entropy network; the outputs are means and scales."""
-        residuals = self.coupled_primitives * self.residual_dim
-        return {
-            "reference": (self.reference_hyper_dim, 2 * self.reference_dim),
-            "covariance": (self.reference_dim, 2 * COVARIANCE_DIM),
-            "residual": (self.residual_hyper_dim + self.reference_dim, 2 * residuals),
-        }
+    @property
+    def reference_dim(self) -> int:
+        return self.channels(Role.REFERENCE)
+
+    def channels(self, role: Role) -> int:
+        """Of all groups of a role together."""
+        return sum(g.channels for g in self.groups if g.role == role)
+
+    def network_size(self, group: GroupShape) -> tuple[int, int]:
+        """(inputs, outputs) of a group's network; the outputs are means and scales."""
+        inputs = sum(self.groups[i].channels for i in group.context)
+        return inputs + COORDINATES * group.sees_coordinates, 2 * group.width(self.coupled_primitives)
+
+    @property
+    def network_sizes(self) -> list[tuple[int, int]]:
+        """Of the networks in the file's order."""
+        return [self.network_size(g) for g in self.groups if g.has_network]
+
+    @property
+    def table_count(self) -> int:
+        """Tables in the file: one for each channel of the groups without network."""
+        return sum(g.width(self.coupled_primitives) for g in self.groups if not g.has_network)
 
     def symbols_per_anchor(self) -> int:
         """With all coupled primitives."""
-        hyper = self.reference_hyper_dim + self.residual_hyper_dim
-        return hyper + self.reference_dim + COVARIANCE_DIM + self.coupled_primitives * self.residual_dim
+        return sum(g.width(self.coupled_primitives) for g in self.groups)
 
 
 @dataclass(frozen=True)
 class FileContent:
     """N anchors with up to K coupled primitives each, and all that is needed to render them."""
 
-    dimensions: Dimensions
+    coupled_primitives: int
+    residual_dim: int
+    heads_layout: Literal["separate", "paired"]
+    width: int
     voxel_size: float  # world units between neighbouring coordinates
+    world_offset: tuple[float, float, float]  # world units: where coordinates (0, 0, 0) are
     view_distance_scale: float  # world units: unit of the view embedding's distance
     background: tuple[float, float, float]  # color behind everything; float32
-    reference_step: float  # quantization steps; float32
-    residual_step: float
-    covariance_step: float  # of log scales
     coordinates: np.ndarray  # [N, 3] int32 voxels
     mask: np.ndarray  # [N, K] bool: which coupled primitives exist
-    reference_hyper: np.ndarray  # [N, reference_hyper_dim] int32 symbols
-    reference: np.ndarray  # [N, reference_dim] int32 symbols
-    covariance: np.ndarray  # [N, 6] int32 symbols
-    residual_hyper: np.ndarray  # [N, residual_hyper_dim] int32 symbols
-    residual: np.ndarray  # [N, K, residual_dim] int32 symbols, zero where the mask is False
-    reference_hyper_tables: tuple[HyperTable, ...]  # one a channel
-    residual_hyper_tables: tuple[HyperTable, ...]
-    networks: dict[str, IntegerNetwork]  # "reference", "covariance", "residual"
+    groups: tuple[Group, ...]
     heads: tuple[tuple[str, QuantizedTensor], ...]  # prediction networks' parameters by name
+    viewpoints: Viewpoints | None = None  # where to look from
     metadata: dict[str, str] = field(default_factory=dict)  # for people; no decoder depends on it
 
+    @property
+    def dimensions(self) -> Dimensions:
+        shapes = tuple(group.shape for group in self.groups)
+        return Dimensions(self.coupled_primitives, self.residual_dim, self.heads_layout, self.width, shapes)
 
-@dataclass(frozen=True)
-class Latents:
-    """Dequantized latents, Q12, in units of their quantization step."""
+    def group(self, role: Role) -> Group:
+        """The first group of a role. Raises KeyError if there is none."""
+        for group in self.groups:
+            if group.shape.role == role:
+                return group
+        raise KeyError(role)
 
-    reference: np.ndarray  # [N, reference_dim] int32
-    covariance: np.ndarray  # [N, 6] int32
-    residual: np.ndarray  # [P, residual_dim] int32: the P coupled primitives that exist, anchor by anchor
+
+# Of each group: dequantized latents, Q12, in units of their quantization step: [N, channels] int32; with RESIDUAL
+# [P, channels], the P coupled primitives that exist, anchor by anchor.
+Latents = tuple[np.ndarray, ...]
 
 
 def fixed_point(symbols: np.ndarray) -> np.ndarray:  # int32, Q12
-    """Hyperprior symbols as the networks take them. Below 2^18, which the format asserts, they fit into 32
+    """Symbols of a group with tables as networks take them. Below 2^18, which the format asserts, they fit into 32
     bits.
     """
     return symbols << FRACTION_BITS
@@ -98,9 +161,46 @@ def reconstruct(symbols: np.ndarray, means: np.ndarray) -> np.ndarray:  # int32,
     return means
 
 
-def residual_context(residual_hyper: np.ndarray, reference_latents: np.ndarray) -> np.ndarray:
-    """[N, residual_hyper_dim + reference_dim] Q12 input of the residual network."""
-    return np.concatenate([fixed_point(residual_hyper), reference_latents], 1)
+def coordinate_context(coordinates: np.ndarray) -> np.ndarray:
+    """[N, 3] voxels of all anchors -> [N, 3] int32 Q12, -1 to 1: where an anchor is in the scene's octree."""
+    origin = octree_origin(coordinates)
+    offsets = coordinates.astype(np.int64) - origin
+    depth = octree_depth(offsets)
+    return ((((2 * offsets + 1) << FRACTION_BITS) >> depth) - (1 << FRACTION_BITS)).astype(np.int32)
+
+
+def network_context(shape: GroupShape, latents: Sequence[np.ndarray], places: np.ndarray) -> np.ndarray:
+    """[N, inputs] Q12 of a group's network, from the latents of the groups before it and `coordinate_context`."""
+    parts = [places] if shape.sees_coordinates else []
+    parts += [latents[i] for i in shape.context]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, 1)
+
+
+def conditional_tables(
+    group: Group | GroupShape,
+    prior: IntegerNetwork | tuple[HyperTable, ...],
+    latents: Sequence[np.ndarray],
+    places: np.ndarray,  # [N, 3] `coordinate_context`
+    mask: np.ndarray,  # [N, K] bool
+) -> tuple[np.ndarray | None, np.ndarray, FrequencyTables]:
+    """What encoder and decoder know of a group before its symbols: means (Q12; None for a group with tables), index of
+    each symbol's table, and the tables. [N, channels]; with RESIDUAL [P, channels].
+    """
+    shape = group.shape if isinstance(group, Group) else group
+    slots = mask if shape.role == Role.RESIDUAL else np.ones((len(mask), 1), np.bool_)
+    if isinstance(prior, IntegerNetwork):
+        context = network_context(shape, latents, places)
+        means, index = entropy_parameters(prior, context, slots)
+        return means, index, gaussian_tables()
+    columns = np.arange(len(prior), dtype=np.uint8).reshape(slots.shape[1], shape.channels)
+    return None, np.broadcast_to(columns, (len(mask), *columns.shape))[slots], channel_tables(prior)
+
+
+def existing_symbols(
+    group: Group, mask: np.ndarray
+) -> np.ndarray:  # [N, channels], with RESIDUAL [P, channels]
+    """A group's symbols without those of coupled primitives that do not exist."""
+    return gather_existing(group.symbols, mask) if group.shape.role == Role.RESIDUAL else group.symbols
 
 
 def gather_existing(slots: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [P, D]
@@ -141,47 +241,25 @@ def _move_rows(slots, existing, mask, rows, gather):
             row += 1
 
 
-def channel_index(anchors: int, channels: int) -> np.ndarray:  # [N, C] uint8
-    """A hyperprior's tables: one a channel."""
-    return np.tile(np.arange(channels, dtype=np.uint8), (anchors, 1))
-
-
 def dequantize(content: FileContent) -> Latents:
     """Latents of all anchors, exactly as any other decoder gets them."""
-    means, _ = entropy_parameters(content.networks["reference"], fixed_point(content.reference_hyper))
-    reference = reconstruct(content.reference, means)
-    means, _ = entropy_parameters(content.networks["covariance"], reference)
-    covariance = reconstruct(content.covariance, means)
-    context = residual_context(content.residual_hyper, reference)
-    means, _ = entropy_parameters(content.networks["residual"], context, content.mask)
-    residual = reconstruct(gather_existing(content.residual, content.mask), means)
-    return Latents(reference, covariance, residual)
+    places = coordinate_context(content.coordinates)
+    latents: list[np.ndarray] = []
+    for group in content.groups:
+        means, _, _ = conditional_tables(group, group.prior, latents, places, content.mask)
+        symbols = existing_symbols(group, content.mask)
+        latents.append(fixed_point(symbols) if means is None else reconstruct(symbols, means))
+    return tuple(latents)
 
 
-def cross_entropy_bits(content: FileContent) -> dict[str, float]:
-    """Code length of each stream under the file's own integer tables, escapes included: what a perfect coder
-    needs.
-    """
-    gaussian = gaussian_tables()
-    anchors = len(content.coordinates)
-    result = {}
-
-    def add(name: str, symbols: np.ndarray, index: np.ndarray, tables: FrequencyTables) -> None:
-        result[name] = float(sum(escape_bits(symbols.ravel(), index.ravel(), tables)))
-
-    for name in ("reference_hyper", "residual_hyper"):
-        tables = getattr(content, f"{name}_tables")
-        add(name, getattr(content, name), channel_index(anchors, len(tables)), channel_tables(tables))
-    means, index = entropy_parameters(content.networks["reference"], fixed_point(content.reference_hyper))
-    add("reference", content.reference, index, gaussian)
-    reference = reconstruct(content.reference, means)
-    add(
-        "covariance",
-        content.covariance,
-        entropy_parameters(content.networks["covariance"], reference)[1],
-        gaussian,
-    )
-    context = residual_context(content.residual_hyper, reference)
-    index = entropy_parameters(content.networks["residual"], context, content.mask)[1]
-    add("residual", gather_existing(content.residual, content.mask), index, gaussian)
-    return {name: result[name] for name in STREAMS}
+def cross_entropy_bits(content: FileContent) -> list[float]:
+    """Code length of each group under the file's own integer tables, escapes included: what a perfect coder needs."""
+    places = coordinate_context(content.coordinates)
+    latents: list[np.ndarray] = []
+    bits = []
+    for group in content.groups:
+        means, index, tables = conditional_tables(group, group.prior, latents, places, content.mask)
+        symbols = existing_symbols(group, content.mask)
+        bits.append(float(sum(escape_bits(symbols.ravel(), index.ravel(), tables))))
+        latents.append(fixed_point(symbols) if means is None else reconstruct(symbols, means))
+    return bits

@@ -5,24 +5,27 @@ the integers that the file holds, are evaluated exactly, in the order in which t
 are whole steps from the means that the *integer* networks give.
 """
 
+import copy
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from compgs import __version__
-from compgs.codec.content import Dimensions, FileContent
+from compgs.codec.content import LOG_SCALES, FileContent, Group, GroupShape, Role
 from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork, evaluate
-from compgs.codec.tables import hyper_tables
+from compgs.codec.tables import HyperTable, hyper_tables
 from compgs.codec.weights import QuantizedTensor
 from compgs.codec.writer import Geometry, write_content
+from compgs.entropy.factorized import FactorizedDensity
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import NotEncodable
+from compgs.model.prediction import SHARED_RESIDUALS
 from compgs.outputs import check_output_file, write_bytes
-from compgs.trained_model import BIAS_BITS, TrainedModel
+from compgs.trained_model import BIAS_BITS, SHARED_RESIDUAL_BITS, TrainedModel
 
 ONE = 1 << FRACTION_BITS
 
@@ -73,81 +76,116 @@ def to_content(model: TrainedModel) -> FileContent:
     mask = model.mask.cpu()[kept].numpy()
 
     def rows(parameter: Tensor) -> Tensor:
-        return parameter.detach().cpu().expand(model.anchors, -1)[kept].double()
+        return parameter.detach().cpu()[kept].double()
 
-    networks = {
-        "reference": integer_network(entropy.reference_network, e.network_bits),
-        "covariance": integer_network(entropy.covariance_network, e.network_bits),
-        "residual": integer_network(entropy.residual_network, e.network_bits),
-    }
-    covariance_step = np.float32(entropy.covariance_step.item())
-    f = rows(model.references)
-    c = rows(model.log_scales) / float(covariance_step)
-    g = rows(model.residuals)
-
-    z_f = _symbols(entropy.reference_analysis.cpu().double()(f))
-    q_f, f_hat = _code(f, z_f * ONE, networks["reference"])
-    q_c, _ = _code(c, f_hat, networks["covariance"])
-    z_g = _symbols(entropy.residual_analysis.cpu().double()(g))
-    if not m.residuals:  # there is nothing to say about them
-        z_g = np.zeros_like(z_g)
-    q_g, _ = _code(g, np.concatenate([z_g * ONE, f_hat], 1), networks["residual"])
-    entropy.float().to(model.device)
-
-    residual = q_g.reshape(len(q_g), m.coupled_primitives, m.residual_dim) * mask[:, :, None]
+    steps = entropy.covariance_step.detach().cpu().numpy().astype(np.float32)
+    groups = _reference_groups(model, rows(model.references))
+    references = groups[-1].latents
+    scales = rows(model.log_scales) / torch.from_numpy(steps.astype(np.float64))
+    shape = GroupShape(Role.LOG_SCALES, LOG_SCALES, tuple(map(float, steps)), (len(groups) - 1,))
+    groups.append(_coded(shape, scales, [references], entropy.covariance_network, e.network_bits))
+    if m.residuals:
+        groups += _residual_groups(model, rows(model.residuals), references, first=len(groups))
+    heads = [
+        (name, quantized_tensor(p, e.head_bits if p.dim() > 1 else BIAS_BITS))
+        for name, p in model.heads.named_parameters()
+    ]
+    if not m.residuals:
+        heads.append((SHARED_RESIDUALS, quantized_tensor(model.shared_residuals(), SHARED_RESIDUAL_BITS)))
+    slots = (m.coupled_primitives, m.residual_dim)
     return FileContent(
-        dimensions=Dimensions(
-            coupled_primitives=m.coupled_primitives,
-            reference_dim=model.reference_dim,
-            residual_dim=m.residual_dim,
-            reference_hyper_dim=e.reference_hyper_dim,
-            residual_hyper_dim=e.residual_hyper_dim,
-            heads=m.heads,
-            width=m.width,
-        ),
+        coupled_primitives=m.coupled_primitives,
+        residual_dim=m.residual_dim,
+        heads_layout=m.heads,
+        width=m.width,
         voxel_size=model.voxel_size,
+        world_offset=(0.0, 0.0, 0.0),
         view_distance_scale=model.distance_unit,
         background=model.background,
-        reference_step=e.reference_step,
-        residual_step=e.residual_step,
-        covariance_step=float(covariance_step),
         coordinates=model.coordinates.cpu()[kept].numpy(),
         mask=mask,
-        reference_hyper=z_f,
-        reference=q_f,
-        covariance=q_c,
-        residual_hyper=z_g,
-        residual=residual,
-        reference_hyper_tables=hyper_tables(
-            entropy.reference_density.probabilities().double().cpu().numpy(), z_f
+        groups=tuple(
+            Group(
+                coded.shape,
+                coded.prior,
+                coded.symbols.reshape(-1, *slots) * mask[:, :, None]
+                if coded.shape.role == Role.RESIDUAL
+                else coded.symbols,
+            )
+            for coded in groups
         ),
-        residual_hyper_tables=hyper_tables(
-            entropy.residual_density.probabilities().double().cpu().numpy(), z_g
-        ),
-        networks=networks,
-        heads=tuple(
-            (name, quantized_tensor(p, e.head_bits if p.dim() > 1 else BIAS_BITS))
-            for name, p in model.heads.named_parameters()
-        ),
+        heads=tuple(heads),
         metadata={"creator": f"compgs {__version__}"},
     )
+
+
+@dataclass(frozen=True)
+class _Coded:
+    """A group before the mask: symbols and latents (Q12) [N, channels of an anchor]."""
+
+    shape: GroupShape
+    prior: IntegerNetwork | tuple[HyperTable, ...]
+    symbols: np.ndarray
+    latents: np.ndarray
+
+
+def _reference_groups(model: TrainedModel, f: Tensor) -> list[_Coded]:
+    e, entropy = model.config.entropy, model.entropy
+    side = _hyperprior(entropy.reference_analysis, entropy.reference_density, f)
+    shape = GroupShape(Role.REFERENCE, f.shape[1], (_float32(e.reference_step),), (0,))
+    return [side, _coded(shape, f, [side.latents], entropy.reference_network, e.network_bits)]
+
+
+def _residual_groups(model: TrainedModel, g: Tensor, references: np.ndarray, first: int) -> list[_Coded]:
+    """`first`: number of the first of these groups in the file."""
+    m, e, entropy = model.config.model, model.config.entropy, model.entropy
+    assert entropy.residual_analysis is not None and entropy.residual_density is not None
+    assert entropy.residual_network is not None
+    side = _hyperprior(entropy.residual_analysis, entropy.residual_density, g)
+    shape = GroupShape(Role.RESIDUAL, m.residual_dim, (_float32(e.residual_step),), (1, first))
+    context = [references, side.latents]
+    return [side, _coded(shape, g, context, entropy.residual_network, e.network_bits)]
+
+
+def _hyperprior(analysis: nn.Module, density: FactorizedDensity, y: Tensor) -> _Coded:
+    # In float64, so that a symbol does not depend on how many anchors are analyzed together.
+    symbols = _symbols(copy.deepcopy(analysis).cpu().double()(y))
+    tables = hyper_tables(density.probabilities().double().cpu().numpy(), symbols)
+    return _Coded(GroupShape(Role.SIDE, symbols.shape[1]), tables, symbols, symbols * ONE)
+
+
+def _coded(
+    shape: GroupShape, y: Tensor, context: list[np.ndarray], network: EntropyNetwork, bits: int
+) -> _Coded:
+    """Symbols of y [N, C], in quantization steps, given the latents that the decoder has by then."""
+    prior = integer_network(network, bits)
+    mean = evaluate(prior, np.concatenate(context, 1))[:, : y.shape[1]]
+    symbols = np.rint(y.numpy() - mean / ONE).astype(np.int32)
+    return _Coded(shape, prior, symbols, symbols * ONE + mean)
+
+
+def _float32(value: float) -> float:
+    return float(np.float32(value))
 
 
 def integer_network(network: EntropyNetwork, bits: int) -> IntegerNetwork:
     """The entropy network as the decoder evaluates it: integer weights, biases in fixed point."""
     layers = network.layers()
+    last = len(layers) - 1
     result = []
     for i, (weight, bias) in enumerate(layers):
         exponent = weight_exponent(weight, bits)
+        ends_branch = 0 < i < last and i % 2 == 0
         result.append(
             IntegerLayer(
                 weight=_symbols(weight.detach().double() * 2.0**exponent, (1 << (bits - 1)) - 1),
                 bias=np.rint(bias.detach().double().cpu().numpy() * ONE).astype(np.int64),
                 shift=exponent,
-                rectify=i < len(layers) - 1,
+                rectify=i < last and not ends_branch,
+                adds=ends_branch,
             )
         )
-    return IntegerNetwork(tuple(result))
+    return IntegerNetwork(tuple(result), skip=last > 0)
 
 
 def quantized_tensor(parameter: Tensor, bits: int) -> QuantizedTensor:
@@ -160,11 +198,3 @@ def quantized_tensor(parameter: Tensor, bits: int) -> QuantizedTensor:
 
 def _symbols(x: Tensor, limit: int = (1 << 31) - 1) -> np.ndarray:
     return x.round().clamp(-limit, limit).cpu().numpy().astype(np.int32)
-
-
-def _code(y: Tensor, context: np.ndarray, network: IntegerNetwork) -> tuple[np.ndarray, np.ndarray]:
-    """Symbols [N, C] and reconstructed latents (fixed point) of y, given what the decoder knows by then."""
-    channels = y.shape[1]
-    mean = evaluate(network, context)[:, :channels]
-    symbols = np.rint(y.cpu().numpy() - mean / ONE).astype(np.int32)
-    return symbols, symbols * ONE + mean

@@ -13,58 +13,60 @@ from dataclasses import dataclass
 from compgs.errors import CorruptSection, NotACompGSFile, NotEncodable, TruncatedSection, UnsupportedVersion
 
 MAGIC = b"\x93CGS"  # not text, and not valid UTF-8
-VERSION = 1
+VERSION = 2
 OPTIONAL = 0x80  # sections with this bit in their number may be skipped by a decoder that does not know them
 MAX_SECTIONS = 64
 MAX_FILE_BYTES = (1 << 32) - 1
 
+# In the order in which a decoder needs them.
 SCENE = 1
 POSITIONS = 2
-MASKS = 3
-HYPER_TABLES = 4
-NETWORKS = 5
-HEADS = 6
-REFERENCE_HYPER = 7
-REFERENCE = 8
-COVARIANCE = 9
-RESIDUAL_HYPER = 10
-RESIDUAL = 11
-POSITIONS_GPCC = 12  # in place of POSITIONS
+POSITIONS_GPCC = 3  # in place of POSITIONS
+MASKS = 4
+TABLES = 5
+NETWORKS = 6
+HEADS = 7
+LATENTS = 8  # once for each range of octree levels, coarse to fine
 METADATA = OPTIONAL | 1
 PADDING = OPTIONAL | 2
+VIEWPOINTS = OPTIONAL | 3
 
 SECTION_NAMES = {
     SCENE: "scene",
     POSITIONS: "positions",
+    POSITIONS_GPCC: "positions (G-PCC)",
     MASKS: "masks",
-    HYPER_TABLES: "hyperprior tables",
+    TABLES: "tables",
     NETWORKS: "entropy networks",
     HEADS: "prediction heads",
-    REFERENCE_HYPER: "reference hyperprior",
-    REFERENCE: "reference embeddings",
-    COVARIANCE: "covariance",
-    RESIDUAL_HYPER: "residual hyperprior",
-    RESIDUAL: "residual embeddings",
-    POSITIONS_GPCC: "positions (G-PCC)",
+    LATENTS: "latents",
     METADATA: "metadata",
     PADDING: "padding",
+    VIEWPOINTS: "viewpoints",
 }
-REQUIRED = tuple(
-    number for number in SECTION_NAMES if not number & OPTIONAL and number not in (POSITIONS, POSITIONS_GPCC)
-)
+REQUIRED = (SCENE, MASKS, TABLES, NETWORKS, HEADS, LATENTS)
 
 # Limits of what a file may hold; a decoder checks them, and the lengths, before it allocates.
 MAX_ANCHORS = 1 << 24
 MAX_COUPLED_PRIMITIVES = 64
 MAX_REFERENCE_DIM = 256
 MAX_RESIDUAL_DIM = 64
-MAX_HYPER_DIM = 64
+MAX_SIDE_DIM = 64
+MAX_GROUPS = 16
+MAX_RANGES = 22  # of octree levels: 0 to 21
 MAX_WIDTH = 1024
 MAX_SYMBOL = 1 << 18  # absolute value of a symbol: latents in Q12 fit into 32 bits
 # Symbols, those of missing coupled primitives included, a file of n bytes may hold: 2^20 + 128 n. A file that
 # says more (1/16 bit a symbol) is refused; a model that compresses so well is padded.
 FREE_SYMBOLS = 1 << 20
 SYMBOLS_PER_BYTE = 128
+# Products (multiplications of entropy networks, and of prediction heads) that decoding and drawing a file of n bytes
+# may take: a constant and so many a byte. Trained scenes take at most a twentieth of the second; the constants are a
+# fraction of a second's work on one core.
+FREE_NETWORK_PRODUCTS = 1 << 28
+NETWORK_PRODUCTS_PER_BYTE = 1 << 15
+FREE_HEAD_PRODUCTS = 1 << 30
+HEAD_PRODUCTS_PER_BYTE = 1 << 17
 MAX_METADATA_BYTES = 4096
 
 _HEADER = struct.Struct("<4sBBB")
@@ -98,16 +100,17 @@ def pack(sections: list[Section]) -> bytes:
     return b"".join([head, _CRC.pack(zlib.crc32(head)), *(s.data for s in sections)])
 
 
-def unpack(data: bytes) -> list[Section]:
-    """Sections of a file, lengths and checksums verified; optional ones that are unknown are among them."""
+def unpack(data: bytes, *, prefix: bool = False) -> list[Section]:
+    """Sections of a file, lengths and checksums verified; optional ones that are unknown are among them.
+
+    `prefix`: the file may end early; the sections that are whole, of which all but latents must be.
+    """
     if (len(data) < len(MAGIC) and MAGIC.startswith(data)) or (
         data[:4] == MAGIC and len(data) < _HEADER.size
     ):
-        raise TruncatedSection(f"header: the file ends after {len(data)} bytes")
+        raise TruncatedSection(f"header: the file ends after {len(data)} bytes; copy or download it again")
     if data[: len(MAGIC)] != MAGIC:
-        raise NotACompGSFile(
-            f"header: expected the bytes {MAGIC.hex(' ')} of a .cgs file, found {data[:4].hex(' ')}"
-        )
+        raise NotACompGSFile("not a .cgs file: it does not begin as one")
     _, version, flags, count = _HEADER.unpack_from(data)
     if version != VERSION:
         remedy = "; install a newer compgs" if version > VERSION else "; encode the scene again"
@@ -116,7 +119,8 @@ def unpack(data: bytes) -> list[Section]:
         )
     if len(data) < container_bytes(count):
         raise TruncatedSection(
-            f"header: {count} sections need {container_bytes(count)} bytes, the file ends after {len(data)}"
+            f"header: {count} sections need {container_bytes(count)} bytes, the file ends after {len(data)}; "
+            "copy or download it again"
         )
     at = container_bytes(count)
     head = data[: at - _CRC.size]
@@ -128,12 +132,16 @@ def unpack(data: bytes) -> list[Section]:
         raise CorruptSection(f"header: {count} sections, expected at most {MAX_SECTIONS}")
     entries = [_ENTRY.unpack_from(head, _HEADER.size + i * _ENTRY.size) for i in range(count)]
     _check_table([number for number, _, _ in entries])
-    sections = []
+    sections: list[Section] = []
     for number, length, crc in entries:
         section = Section(number, data[at : at + length])
         if len(section.data) < length:
+            have = {s.number for s in sections}
+            if prefix and have.issuperset(REQUIRED):
+                return sections
             raise TruncatedSection(
-                f"{section.name}: header promises {length} bytes, the file ends after {len(section.data)}"
+                f"{section.name}: header promises {length} bytes, the file ends after {len(section.data)}; "
+                "copy or download it again"
             )
         if zlib.crc32(section.data) != crc:
             raise CorruptSection(
@@ -146,19 +154,34 @@ def unpack(data: bytes) -> list[Section]:
     return sections
 
 
+def section_ends(data: bytes) -> list[tuple[int, int]]:
+    """(number, bytes of the file up to the section's end) of each section, from the header alone; see `unpack`."""
+    count = data[_HEADER.size - 1]
+    at, ends = container_bytes(count), []
+    for i in range(count):
+        number, length, _ = _ENTRY.unpack_from(data, _HEADER.size + i * _ENTRY.size)
+        at += length
+        ends.append((number, at))
+    return ends
+
+
 def _check_table(numbers: list[int]) -> None:
-    """All required sections and one of the positions, each once, in order; optional ones behind them, each once; no
-    unknown required ones.
+    """All required sections and one of the positions, in order, each once but the latents; optional ones anywhere,
+    each once; no unknown required ones.
     """
     for number in numbers:
         if not number & OPTIONAL and number not in SECTION_NAMES:
             raise UnsupportedVersion(
                 f"header: section {number} is unknown and must not be skipped; install a newer compgs"
             )
-    if numbers != sorted(set(numbers)):
+    required = [number for number in numbers if not number & OPTIONAL]
+    once = [number for number in numbers if number != LATENTS]
+    if required != sorted(required) or len(once) != len(set(once)):
         raise CorruptSection("header: the sections are not in ascending order, each once")
     missing = [SECTION_NAMES[number] for number in REQUIRED if number not in numbers]
     if missing:
         raise CorruptSection(f"header: the section {missing[0]!r} is missing")
     if (POSITIONS in numbers) == (POSITIONS_GPCC in numbers):
-        raise CorruptSection("header: expected one section of positions, 2 or 12")
+        raise CorruptSection("header: expected one section of positions, 2 or 3")
+    if numbers.count(LATENTS) > MAX_RANGES:
+        raise CorruptSection(f"header: {numbers.count(LATENTS)} ranges, expected at most {MAX_RANGES}")

@@ -3,8 +3,10 @@
 Activations are fixed-point numbers with 12 fractional bits ("Q12"), weights are integers, rounding is a shift
 and the non-linearity a shift and a maximum:
 
-    y = ((W x + 2^(shift - 1)) >> shift) + bias;    rectify: y = max(y, y >> 6);    y = clamp(y, -2^23, 2^23 -
-    1)
+    y = ((W x + 2^(shift - 1)) >> shift) + bias;    rectify: y = max(y, y >> 6);
+    adds: y = y + the activations that the layer before took;    y = clamp(y, -2^23, 2^23 - 1)
+
+The last layer may take the network's own inputs, too, behind the activations before it: a linear skip.
 
 Evaluated in float64: every product and partial sum is an integer below 2^53, so floating point is exact in
 any order, on any device, and as fast as the machine's matrix product.
@@ -35,6 +37,7 @@ class IntegerLayer:
     bias: np.ndarray  # [out] int64, Q12
     shift: int  # 0 ... 30: weights are in units of 2^-shift
     rectify: bool  # leaky ReLU after it
+    adds: bool = False  # the end of a residual branch: adds the inputs of the layer before
 
 
 @dataclass(frozen=True)
@@ -42,12 +45,24 @@ class IntegerNetwork:
     """Layers one after the other. Raises ValueError if they do not fit or could leave 53 bits."""
 
     layers: tuple[IntegerLayer, ...]
+    skip: bool = (
+        False  # the last of several layers takes the network's inputs behind the activations before it
+    )
 
     def __post_init__(self) -> None:
         if not self.layers:
             raise ValueError("an integer network needs at least one layer")
+        if self.skip and len(self.layers) == 1:
+            raise ValueError("a skip needs layers to pass by, found a single one")
         width = self.layers[0].weight.shape[-1]
         for i, layer in enumerate(self.layers):
+            last = i == len(self.layers) - 1
+            if self.skip and last:
+                width += self.inputs
+            if layer.adds and (i == 0 or last or self.layers[i - 1].weight.shape[1] != layer.weight.shape[0]):
+                raise ValueError(
+                    f"layer {i}: {layer.weight.shape[0]} outputs cannot be added to what the layer before takes"
+                )
             if layer.weight.ndim != 2 or layer.weight.shape[1] != width or 0 in layer.weight.shape:
                 raise ValueError(f"layer {i}: weight has shape {layer.weight.shape}, expected [out, {width}]")
             width = layer.weight.shape[0]
@@ -64,6 +79,11 @@ class IntegerNetwork:
                 )
 
     @property
+    def products(self) -> int:
+        """Multiplications that a row takes: the number of weights."""
+        return sum(layer.weight.size for layer in self.layers)
+
+    @property
     def inputs(self) -> int:
         return self.layers[0].weight.shape[1]
 
@@ -78,9 +98,8 @@ def evaluate(
 ) -> np.ndarray:  # [N, outputs] int32, Q12
     """The network's outputs, exactly: they do not depend on batch size, order, threads or device."""
     out = np.empty((len(x), network.outputs), np.int32)
-    last = network.layers[-1]
     for start, block in _inputs_of_last(network, x):
-        _layer(block, _matrix(last), last.bias, last.shift, last.rectify, out[start : start + len(block)])
+        out[start : start + len(block)] = _affine(network.layers[-1], block, block)
     return out
 
 
@@ -122,12 +141,19 @@ def _inputs_of_last(network: IntegerNetwork, x: np.ndarray) -> Iterator[tuple[in
     """(first row, inputs of the last layer) of one block of rows after the other."""
     assert x.ndim == 2 and x.shape[1] == network.inputs
     for start in range(0, len(x), BLOCK_ROWS):
-        block = np.ascontiguousarray(x[start : start + BLOCK_ROWS])
+        inputs = np.ascontiguousarray(x[start : start + BLOCK_ROWS])
+        before, block = inputs, inputs
         for layer in network.layers[:-1]:
-            out = np.empty((len(block), len(layer.bias)), np.int32)
-            _layer(block, _matrix(layer), layer.bias, layer.shift, layer.rectify, out)
-            block = out
-        yield start, block
+            before, block = block, _affine(layer, block, before)
+        yield start, np.concatenate([block, inputs], 1) if network.skip else block
+
+
+def _affine(layer: IntegerLayer, x: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """A layer's outputs [N, out] int32; `before` [N, out]: what its branch began with, if it adds that."""
+    out = np.empty((len(x), len(layer.bias)), np.int32)
+    added = before if layer.adds else np.empty((0, len(layer.bias)), np.int32)
+    _layer(x, _matrix(layer), layer.bias, layer.shift, layer.rectify, added, out)
+    return out
 
 
 def _matrix(layer: IntegerLayer) -> np.ndarray:
@@ -139,11 +165,16 @@ def _matrix(layer: IntegerLayer) -> np.ndarray:
 
 
 @njit(cache=True, inline="always")
+def _clamped(x):
+    v = min(np.int64(x), ACTIVATION_LIMIT - 1)
+    return max(v, -ACTIVATION_LIMIT)
+
+
+@njit(cache=True, inline="always")
 def _sums(x, weight, inputs, sums):
     """W x of one row. Four inputs at a time, so that each sum is loaded and stored once for four products."""
     for i in range(len(x)):
-        v = min(np.int64(x[i]), ACTIVATION_LIMIT - 1)
-        inputs[i] = max(v, -ACTIVATION_LIMIT)
+        inputs[i] = _clamped(x[i])
     sums[:] = 0.0
     for i in range(0, len(inputs), 4):
         a, b, c, d = inputs[i], inputs[i + 1], inputs[i + 2], inputs[i + 3]
@@ -163,7 +194,8 @@ def _activation(a, bias, half, scale, rectify):
 
 
 @njit(cache=True, parallel=True)
-def _layer(x, weight, bias, shift, rectify, out):
+def _layer(x, weight, bias, shift, rectify, added, out):
+    """added [N, out] or [0, out]: nothing."""
     scale = 1.0 / (1 << shift)
     half = float(1 << (shift - 1)) if shift > 0 else 0.0
     for block in prange((len(x) + TASK_ROWS - 1) // TASK_ROWS):
@@ -172,7 +204,10 @@ def _layer(x, weight, bias, shift, rectify, out):
         for n in range(block * TASK_ROWS, min((block + 1) * TASK_ROWS, len(x))):
             _sums(x[n], weight, inputs, sums)
             for c in range(out.shape[1]):
-                out[n, c] = np.int32(_activation(sums[c], float(bias[c]), half, scale, rectify))
+                y = _activation(sums[c], float(bias[c]), half, scale, rectify)
+                if len(added) > 0:
+                    y = float(_clamped(np.int64(y) + _clamped(added[n, c])))
+                out[n, c] = np.int32(y)
 
 
 @njit(cache=True, parallel=True)

@@ -72,21 +72,46 @@ def decode_symbols(
     """Inverse of `encode_symbols`. Raises CorruptSection, with the section's name, for bytes that it cannot
     have made.
     """
-    count = len(table_index)
     reader = FieldReader(data, section)
-    if count == 0:
-        reader.end()
-        return np.zeros(0, np.int32)
-    assert int(table_index.max()) < len(tables)
+    symbols = read_symbols(reader, table_index, tables)
+    reader.end()
+    return symbols
+
+
+def skip_symbols(reader: FieldReader, count: int) -> int:
+    """Bytes of a stream of `count` symbols, which is read over."""
+    start = reader.position
+    ends, escape_size = _sizes(reader, count)
+    reader.bytes(4 * int(ends[-1]) + escape_size, "words and escapes")
+    return reader.position - start
+
+
+def _sizes(reader: FieldReader, count: int) -> tuple[np.ndarray, int]:
+    """Where each chunk's words end [chunks + 1], and bytes of escapes."""
     chunks = -(-count // CHUNK_SYMBOLS)
     ends = np.zeros(chunks + 1, np.int64)
+    if count == 0:
+        return ends, 0
     for i in range(chunks):
         inside = min(CHUNK_SYMBOLS, count - i * CHUNK_SYMBOLS)
         ends[i + 1] = ends[i] + reader.varint(f"words of chunk {i}", 2, _max_words(inside))
-    escape_size = reader.varint("bytes of escapes", 0, MAX_ESCAPE_BYTES * count)
+    return ends, reader.varint("bytes of escapes", 0, MAX_ESCAPE_BYTES * count)
+
+
+def read_symbols(
+    reader: FieldReader,
+    table_index: np.ndarray,  # [M] uint8
+    tables: FrequencyTables,
+) -> np.ndarray:  # [M] int32
+    """`decode_symbols` of a stream behind which others follow."""
+    count, section = len(table_index), reader.section
+    if count == 0:
+        return np.zeros(0, np.int32)
+    assert int(table_index.max()) < len(tables)
+    ends, escape_size = _sizes(reader, count)
+    chunks = len(ends) - 1
     words = np.frombuffer(reader.bytes(4 * int(ends[-1]), "words"), "<u4").astype(np.uint32)
     escape_data = np.frombuffer(reader.bytes(escape_size, "escapes"), np.uint8).copy()
-    reader.end()
     symbols = np.empty(count, np.int32)
     escapes = np.zeros(chunks, np.int64)
     table_index = np.ascontiguousarray(table_index, np.uint8)

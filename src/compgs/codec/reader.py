@@ -1,61 +1,68 @@
 """Bytes become integers: the mirror image of writer.py, section by section. Nothing is taken on trust."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
+from compgs.codec.anchor_order import level_counts
 from compgs.codec.content import (
     Dimensions,
     FileContent,
+    Group,
     Latents,
-    channel_index,
-    fixed_point,
-    reconstruct,
-    residual_context,
+    Role,
+    coordinate_context,
     scatter_existing,
 )
+from compgs.codec.fields import FieldReader
 from compgs.codec.format import (
-    COVARIANCE,
-    FREE_SYMBOLS,
     HEADS,
-    HYPER_TABLES,
+    LATENTS,
     MASKS,
-    MAX_SYMBOL,
     METADATA,
     NETWORKS,
     PADDING,
     POSITIONS,
     POSITIONS_GPCC,
-    REFERENCE,
-    REFERENCE_HYPER,
-    RESIDUAL,
-    RESIDUAL_HYPER,
     SCENE,
     SECTION_NAMES,
-    SYMBOLS_PER_BYTE,
+    TABLES,
     VERSION,
+    VIEWPOINTS,
+    Section,
     container_bytes,
     unpack,
 )
-from compgs.codec.integer_network import entropy_parameters
+from compgs.codec.latents import Prior, RangeHead, decode_range, read_head, stream_sizes
+from compgs.codec.limits import HEAD_PRODUCTS, NETWORK_PRODUCTS, SYMBOLS, check_amount, symbols
 from compgs.codec.mask_coder import decode_masks
 from compgs.codec.octree import decode_positions
-from compgs.codec.rans import decode_symbols
-from compgs.codec.sections import SceneSection, decode_hyper_tables, decode_metadata, decode_scene
-from compgs.codec.tables import FrequencyTables, channel_tables, gaussian_tables
+from compgs.codec.sections import SceneSection, decode_metadata, decode_scene, decode_tables
 from compgs.codec.tmc3 import decode_positions_tmc3
+from compgs.codec.viewpoints import decode_viewpoints
 from compgs.codec.weights import decode_heads, decode_networks
 from compgs.errors import CorruptSection
 
 
 @dataclass(frozen=True)
 class SectionInfo:
-    """What a section costs."""
+    """What a section, or a group of latents in all ranges, costs."""
 
     name: str
     bytes: int
     bits_per_anchor: float
     bits_per_coupled: float  # per coupled primitive that exists
+
+
+@dataclass(frozen=True)
+class RangeInfo:
+    """A beginning of the file that is a scene."""
+
+    level: int  # of the octree
+    anchors: int  # up to this level
+    bytes: int  # of the file up to here
 
 
 @dataclass(frozen=True)
@@ -71,11 +78,32 @@ class FileInfo:
     dimensions: Dimensions
     scene: SceneSection
     sections: tuple[SectionInfo, ...]
+    ranges: tuple[RangeInfo, ...]
     metadata: dict[str, str]
 
     @property
     def bits_per_anchor(self) -> float:
         return 8.0 * self.bytes / self.anchors
+
+
+def group_names(dimensions: Dimensions) -> list[str]:
+    """What people call the groups; a side group is named after the next one that takes it."""
+    names = {
+        Role.REFERENCE: "reference embeddings",
+        Role.LOG_SCALES: "log scales",
+        Role.RESIDUAL: "residual embeddings",
+    }
+    result = []
+    for i, shape in enumerate(dimensions.groups):
+        if shape.role != Role.SIDE:
+            result.append(names[shape.role])
+            continue
+        users = [g.role for g in dimensions.groups if i in g.context]
+        kind = {Role.REFERENCE: "reference ", Role.RESIDUAL: "residual "}.get(
+            users[0] if users else shape.role, ""
+        )
+        result.append(f"{kind}hyperprior")
+    return result
 
 
 def read_content(data: bytes) -> FileContent:
@@ -87,105 +115,164 @@ def read_content(data: bytes) -> FileContent:
     return read_latents(data)[0]
 
 
-def read_latents(data: bytes, *, keep_symbols: bool = True) -> tuple[FileContent, Latents]:
-    """The content, and its latents, which the entropy decoder needs anyway (`dequantize` would compute them
-    again). Not `keep_symbols`: each stream's symbols go, and are empty in the content, as soon as they have
-    served; with all of them the peak of memory would be above three times the size of the model.
+def read_latents(
+    data: bytes, *, keep_symbols: bool = True, prefix: bool = False
+) -> tuple[FileContent, Latents]:
+    """The content, and its latents, which the entropy decoder needs anyway (`dequantize` would compute them again).
+
+    `prefix`: the file may end early; of the anchors, those whose ranges are there. Not `keep_symbols`: symbols are
+    empty in the content; with all of them the peak of memory would be above three times the size of the model.
     """
-    sections = {section.number: section.data for section in unpack(data)}
-    scene = decode_scene(sections[SCENE], SECTION_NAMES[SCENE])
+    sections = unpack(data, prefix=prefix)
+    by_number = {section.number: section.data for section in sections}
+    scene = decode_scene(by_number[SCENE], SECTION_NAMES[SCENE])
     d = scene.dimensions
-    _check_amount(scene, len(data))
-    if any(sections.get(PADDING, b"")):
+    ranges = [section for section in sections if section.number == LATENTS]
+    heads_of_ranges = [read_head(FieldReader(r.data, r.name)) for r in ranges]
+    anchors = sum(head.anchors for head in heads_of_ranges) if prefix else scene.anchors
+    check_amount(SYMBOLS, symbols(d, anchors), len(data), SECTION_NAMES[SCENE])
+    if any(by_number.get(PADDING, b"")):
         raise CorruptSection(f"{SECTION_NAMES[PADDING]}: expected zero bytes")
-    metadata = decode_metadata(sections[METADATA], SECTION_NAMES[METADATA]) if METADATA in sections else {}
-    hyper_tables = decode_hyper_tables(
-        sections[HYPER_TABLES], SECTION_NAMES[HYPER_TABLES], d.reference_hyper_dim + d.residual_hyper_dim
+    metadata = decode_metadata(by_number[METADATA], SECTION_NAMES[METADATA]) if METADATA in by_number else {}
+    viewpoints = None
+    if VIEWPOINTS in by_number:
+        viewpoints = decode_viewpoints(by_number[VIEWPOINTS], SECTION_NAMES[VIEWPOINTS])
+    tables = decode_tables(by_number[TABLES], SECTION_NAMES[TABLES], d.table_count)
+
+    def check_products(limit: tuple[str, int, int], rows: int, number: int, weights: int) -> None:
+        check_amount(limit, rows * weights, len(data), SECTION_NAMES[number])
+
+    networks = decode_networks(
+        by_number[NETWORKS],
+        SECTION_NAMES[NETWORKS],
+        d.network_sizes,
+        partial(check_products, NETWORK_PRODUCTS, anchors, NETWORKS),
     )
-    reference_hyper_tables = hyper_tables[: d.reference_hyper_dim]
-    residual_hyper_tables = hyper_tables[d.reference_hyper_dim :]
-    networks = decode_networks(sections[NETWORKS], SECTION_NAMES[NETWORKS], d.network_sizes())
-    heads = decode_heads(sections[HEADS], SECTION_NAMES[HEADS])
-    if POSITIONS in sections:
-        coordinates = decode_positions(sections[POSITIONS], scene.anchors)
+    coupled = sum(head.coupled for head in heads_of_ranges) if prefix else scene.coupled
+    heads = decode_heads(
+        by_number[HEADS], SECTION_NAMES[HEADS], partial(check_products, HEAD_PRODUCTS, coupled, HEADS)
+    )
+    priors = _priors(d, iter(networks), iter(tables))
+    if POSITIONS in by_number:
+        coordinates = decode_positions(by_number[POSITIONS], scene.anchors)
     else:
-        coordinates = decode_positions_tmc3(sections[POSITIONS_GPCC], scene.anchors)
-    mask = decode_masks(sections[MASKS], scene.anchors, d.coupled_primitives)
-    coupled = int(mask.sum())
-    if coupled != scene.coupled:
+        coordinates = decode_positions_tmc3(by_number[POSITIONS_GPCC], scene.anchors)
+    mask = decode_masks(by_number[MASKS], scene.anchors, d.coupled_primitives)
+    if int(mask.sum()) != scene.coupled:
         raise CorruptSection(
-            f"masks: {coupled} coupled primitives exist, the scene section promises {scene.coupled}"
+            f"masks: {int(mask.sum())} coupled primitives exist, the scene section promises {scene.coupled}"
         )
-
-    gaussian = gaussian_tables()
-
-    def stream(number: int, index: np.ndarray, tables: FrequencyTables) -> np.ndarray:
-        symbols = decode_symbols(sections[number], index.ravel(), tables, SECTION_NAMES[number])
-        if len(symbols) and (symbols.min() < -MAX_SYMBOL or symbols.max() > MAX_SYMBOL):
-            raise CorruptSection(f"{SECTION_NAMES[number]}: a symbol is not in -{MAX_SYMBOL} to {MAX_SYMBOL}")
-        return symbols.reshape(index.shape)
-
-    def kept(symbols: np.ndarray) -> np.ndarray:
-        return symbols if keep_symbols else np.empty((0, 0), np.int32)
-
-    index = channel_index(scene.anchors, d.reference_hyper_dim)
-    reference_hyper = stream(REFERENCE_HYPER, index, channel_tables(reference_hyper_tables))
-    means, index = entropy_parameters(networks["reference"], fixed_point(reference_hyper))
-    reference = stream(REFERENCE, index, gaussian)
-    reference_latents = reconstruct(reference, means)
-    reference_hyper, reference = kept(reference_hyper), kept(reference)
-    del means, index
-
-    means, index = entropy_parameters(networks["covariance"], reference_latents)
-    covariance = stream(COVARIANCE, index, gaussian)
-    covariance_latents = reconstruct(covariance, means)
-    covariance = kept(covariance)
-    del means, index
-
-    index = channel_index(scene.anchors, d.residual_hyper_dim)
-    residual_hyper = stream(RESIDUAL_HYPER, index, channel_tables(residual_hyper_tables))
-    context = residual_context(residual_hyper, reference_latents)
-    residual_hyper = kept(residual_hyper)
-    means, index = entropy_parameters(networks["residual"], context, mask)
-    symbols = stream(RESIDUAL, index, gaussian)
-    del context, index  # the peak of memory comes next
-    residual_latents = reconstruct(symbols, means)
-    del means
-    residual = scatter_existing(symbols, mask) if keep_symbols else kept(symbols)
-
+    _check_ranges(heads_of_ranges, level_counts(coordinates), mask, whole=not prefix)
+    places = coordinate_context(coordinates)[:anchors]
+    coordinates, mask = coordinates[:anchors], mask[:anchors]
+    all_symbols, latents = _decode_ranges(ranges, heads_of_ranges, d, priors, mask, places, keep_symbols)
     content = FileContent(
-        dimensions=d,
+        coupled_primitives=d.coupled_primitives,
+        residual_dim=d.residual_dim,
+        heads_layout=d.heads,
+        width=d.width,
         voxel_size=scene.voxel_size,
+        world_offset=scene.world_offset,
         view_distance_scale=scene.view_distance_scale,
         background=scene.background,
-        reference_step=scene.reference_step,
-        residual_step=scene.residual_step,
-        covariance_step=scene.covariance_step,
         coordinates=coordinates,
         mask=mask,
-        reference_hyper=reference_hyper,
-        reference=reference,
-        covariance=covariance,
-        residual_hyper=residual_hyper,
-        residual=residual,
-        reference_hyper_tables=reference_hyper_tables,
-        residual_hyper_tables=residual_hyper_tables,
-        networks=networks,
+        groups=tuple(map(Group, d.groups, priors, all_symbols)),
         heads=heads,
+        viewpoints=viewpoints,
         metadata=metadata,
     )
-    return content, Latents(reference_latents, covariance_latents, residual_latents)
+    return content, latents
+
+
+def _priors(d: Dimensions, networks: Iterator, tables: Iterator) -> list[Prior]:
+    """What each group is coded with, from the networks and tables of the file."""
+    return [
+        next(networks)
+        if shape.has_network
+        else tuple(next(tables) for _ in range(shape.width(d.coupled_primitives)))
+        for shape in d.groups
+    ]
+
+
+def _check_ranges(heads: list[RangeHead], counts: np.ndarray, mask: np.ndarray, *, whole: bool) -> None:
+    """The ranges must be those of the octree's levels, and all of them in a `whole` file."""
+    place, first = SECTION_NAMES[LATENTS], 0
+    levels = [head.level for head in heads]
+    if levels != sorted(set(levels)) or levels[-1] >= len(counts):
+        raise CorruptSection(f"{place}: levels are {levels}, expected ascending ones up to {len(counts) - 1}")
+    if whole and levels[-1] != len(counts) - 1:
+        raise CorruptSection(f"{place}: the last level is {levels[-1]}, expected {len(counts) - 1}")
+    for head in heads:
+        end = int(counts[head.level])
+        coupled = int(mask[first:end].sum())
+        if (head.anchors, head.coupled) != (end - first, coupled):
+            raise CorruptSection(
+                f"{place}: up to level {head.level} {head.anchors} anchors with {head.coupled} coupled primitives, "
+                f"expected {end - first} with {coupled}"
+            )
+        first = end
+
+
+def _decode_ranges(
+    ranges: list[Section],
+    heads: list[RangeHead],
+    d: Dimensions,
+    priors: list[Prior],
+    mask: np.ndarray,
+    places: np.ndarray,
+    keep_symbols: bool,
+) -> tuple[list[np.ndarray], Latents]:
+    """Symbols of each group as `Group` has them (empty if they are not kept), and latents."""
+    coupled = sum(head.coupled for head in heads)
+    rows = [coupled if shape.role == Role.RESIDUAL else len(mask) for shape in d.groups]
+    latents = tuple(np.empty((n, g.channels), np.int32) for n, g in zip(rows, d.groups, strict=True))
+    kept = [
+        np.empty((n if keep_symbols else 0, g.channels), np.int32)
+        for n, g in zip(rows, d.groups, strict=True)
+    ]
+    anchor = primitive = 0
+    for section, head in zip(ranges, heads, strict=True):
+        reader = FieldReader(section.data, section.name)
+        read_head(reader)
+        part = slice(anchor, anchor + head.anchors)
+        parts = decode_range(reader, d, priors, mask[part], places[part])
+        for i, shape in enumerate(d.groups):
+            to = slice(primitive, primitive + head.coupled) if shape.role == Role.RESIDUAL else part
+            latents[i][to] = parts[1][i]
+            if keep_symbols:
+                kept[i][to] = parts[0][i]
+        anchor, primitive = anchor + head.anchors, primitive + head.coupled
+    symbols_of = [
+        scatter_existing(kept[i], mask) if keep_symbols and shape.role == Role.RESIDUAL else kept[i]
+        for i, shape in enumerate(d.groups)
+    ]
+    return symbols_of, latents
 
 
 def file_info(data: bytes) -> FileInfo:
-    """Bytes and bits by section; verifies the checksums and decodes the scene section alone."""
+    """Bytes and bits by section and group; verifies the checksums, decodes the scene section and the ranges' heads."""
     sections = unpack(data)
     by_number = {section.number: section.data for section in sections}
     scene = decode_scene(by_number[SCENE], SECTION_NAMES[SCENE])
-    _check_amount(scene, len(data))
+    check_amount(SYMBOLS, symbols(scene.dimensions, scene.anchors), len(data), SECTION_NAMES[SCENE])
     metadata = decode_metadata(by_number[METADATA], SECTION_NAMES[METADATA]) if METADATA in by_number else {}
-    sizes = [(section.name, len(section.data)) for section in sections]
-    sizes.append(("container", container_bytes(len(sections))))
+    names = group_names(scene.dimensions)
+    streams = [0] * len(names)
+    sizes: list[tuple[str, int]] = []
+    ranges: list[RangeInfo] = []
+    at, anchors, heads = container_bytes(len(sections)), 0, 0
+    for section in sections:
+        at += len(section.data)
+        if section.number != LATENTS:
+            sizes.append((section.name, len(section.data)))
+            continue
+        head, parts = stream_sizes(section.data, scene.dimensions)
+        anchors += head.anchors
+        heads += len(section.data) - sum(parts)
+        streams = [a + b for a, b in zip(streams, parts, strict=True)]
+        ranges.append(RangeInfo(head.level, anchors, at))
+    sizes += [*zip(names, streams, strict=True), ("container", container_bytes(len(sections)) + heads)]
     return FileInfo(
         version=VERSION,
         bytes=len(data),
@@ -197,16 +284,6 @@ def file_info(data: bytes) -> FileInfo:
             SectionInfo(name, size, 8.0 * size / scene.anchors, 8.0 * size / max(scene.coupled, 1))
             for name, size in sizes
         ),
+        ranges=tuple(ranges),
         metadata=metadata,
     )
-
-
-def _check_amount(scene: SceneSection, size: int) -> None:
-    """Symbols against the file's size, before anything is allocated."""
-    symbols = scene.anchors * scene.dimensions.symbols_per_anchor()
-    allowed = FREE_SYMBOLS + SYMBOLS_PER_BYTE * size
-    if symbols > allowed:
-        raise CorruptSection(
-            f"{SECTION_NAMES[SCENE]}: {scene.anchors} anchors promise {symbols} symbols, "
-            f"a file of {size} bytes holds at most {allowed}"
-        )

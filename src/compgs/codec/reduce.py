@@ -6,22 +6,22 @@ their symbols are 0, 1 or -1, and a coarser step either leaves those where they 
 (docs/rates.md has what it costs).
 """
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
-from compgs.codec.content import FileContent, dequantize
-from compgs.codec.integer_network import (
-    BIAS_LIMIT,
-    FRACTION_BITS,
-    IntegerLayer,
-    IntegerNetwork,
-    entropy_parameters,
+from compgs.codec.content import (
+    LOG_SCALES,
+    FileContent,
+    Group,
+    Role,
+    conditional_tables,
+    coordinate_context,
+    dequantize,
 )
+from compgs.codec.integer_network import BIAS_LIMIT, FRACTION_BITS, IntegerNetwork
 from compgs.codec.tables import SCALES_PER_OCTAVE
-
-ROWS = ("coordinates", "mask", "reference_hyper", "reference", "covariance", "residual_hyper", "residual")
+from compgs.errors import NotEncodable
 
 
 def without_coupled(content: FileContent, kept: np.ndarray) -> FileContent:
@@ -29,40 +29,55 @@ def without_coupled(content: FileContent, kept: np.ndarray) -> FileContent:
     mask = content.mask.copy()
     mask[mask] = kept
     anchors = mask.any(1)
-    content = replace(content, mask=mask, residual=content.residual * mask[:, :, None])
-    return replace(content, **{name: getattr(content, name)[anchors] for name in ROWS})
+
+    def narrowed(group: Group) -> Group:
+        symbols = group.symbols
+        if group.shape.role == Role.RESIDUAL:
+            symbols = symbols * mask[:, :, None]
+        return replace(group, symbols=symbols[anchors])
+
+    return replace(
+        content,
+        coordinates=content.coordinates[anchors],
+        mask=mask[anchors],
+        groups=tuple(map(narrowed, content.groups)),
+    )
 
 
 def with_coarser_covariances(content: FileContent, ratio: float) -> FileContent:
-    """Log scales in steps that are `ratio` times as large; nothing else is conditioned on them.
+    """Log scales in steps that are `ratio` times as large.
 
+    Raises NotEncodable if other latents are conditioned on them.
     In the new unit, means are the old ones over the ratio, and scales, counted in twelfths of an octave, are lower by
     12 log2(ratio): both go into the network's last layer. Symbols are rounded again, from the values that the file had.
     """
-    step = float(np.float32(content.covariance_step * ratio))
-    ratio = step / content.covariance_step
+    index = next(i for i, g in enumerate(content.groups) if g.shape.role == Role.LOG_SCALES)
+    group = content.groups[index]
+    taken = any(index in other.shape.context for other in content.groups)
+    if taken or group.shape.channels < LOG_SCALES or not isinstance(group.prior, IntegerNetwork):
+        raise NotEncodable("log scales: other latents depend on them; coarser ones need another training")
+    steps = tuple(float(np.float32(step * ratio)) for step in group.shape.steps)
+    ratios = np.broadcast_to(np.array(steps) / np.array(group.shape.steps), LOG_SCALES)
     latents = dequantize(content)
-    network = rescaled(content.networks["covariance"], ratio)
-    means, _ = entropy_parameters(network, latents.reference)
-    symbols = np.rint((latents.covariance / ratio - means) / (1 << FRACTION_BITS)).astype(np.int32)
-    return replace(
-        content,
-        covariance_step=step,
-        covariance=symbols,
-        networks={**content.networks, "covariance": network},
-    )
+    network = rescaled(group.prior, ratios)
+    shape = replace(group.shape, steps=steps)
+    coded = replace(group, shape=shape, prior=network)
+    places = coordinate_context(content.coordinates)
+    means, _, _ = conditional_tables(coded, network, latents, places, content.mask)
+    symbols = np.rint((latents[index] / ratios - means) / (1 << FRACTION_BITS)).astype(np.int32)
+    groups = list(content.groups)
+    groups[index] = replace(coded, symbols=symbols)
+    return replace(content, groups=tuple(groups))
 
 
-def rescaled(network: IntegerNetwork, ratio: float) -> IntegerNetwork:
-    """The network for symbols in a unit that is `ratio` times as large."""
+def rescaled(network: IntegerNetwork, ratios: np.ndarray) -> IntegerNetwork:
+    """The network for symbols in units that are `ratios` [C] times as large."""
     *first, last = network.layers
     channels = len(last.bias) // 2
     weight, bias = last.weight.astype(np.float64), last.bias.astype(np.float64)
-    weight[:channels] /= ratio
-    bias[:channels] /= ratio
-    bias[channels:] -= SCALES_PER_OCTAVE * math.log2(ratio) * (1 << FRACTION_BITS)
+    weight[:channels] /= ratios[:, None]
+    bias[:channels] /= ratios
+    bias[channels:] -= SCALES_PER_OCTAVE * np.log2(ratios) * (1 << FRACTION_BITS)
     bias = bias.clip(1 - BIAS_LIMIT, BIAS_LIMIT - 1)
-    layer = IntegerLayer(
-        np.rint(weight).astype(np.int32), np.rint(bias).astype(np.int64), last.shift, last.rectify
-    )
-    return IntegerNetwork((*first, layer))
+    layer = replace(last, weight=np.rint(weight).astype(np.int32), bias=np.rint(bias).astype(np.int64))
+    return replace(network, layers=(*first, layer))

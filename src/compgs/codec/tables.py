@@ -27,6 +27,7 @@ GAUSSIAN_CRC32 = 0xAD3B4090  # of gaussian_tables.bin; tools/make_gaussian_table
 
 LEVELS = 128  # levels of a hyperprior's table: eighths of an octave
 MAX_HYPER_SYMBOLS = 1024  # in one channel's table, without the escape
+MAX_TABLES = 256  # of a group: a table's number is a byte
 MAX_LOWEST = 1 << 18  # absolute value of a table's lowest symbol
 # floor(2^(10 + m/8)), m = 0 ... 7
 MANTISSAS = (1024, 1116, 1217, 1327, 1448, 1579, 1722, 1878)

@@ -5,7 +5,8 @@ than the widest table leaves some low bits uncoded. Table and number of low bits
 counting bits.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +17,10 @@ from compgs.codec.rans import decode_symbols, encode_symbols
 from compgs.codec.tables import GAUSSIAN_COUNT, SCALES_PER_OCTAVE, SMALLEST_SCALE_OCTAVE, gaussian_tables
 from compgs.errors import CorruptSection, NotEncodable
 
-NETWORKS = ("reference", "covariance", "residual")  # in the file's order
 MAX_LAYERS = 8
+# A network's flag, and those of a layer beside its shift.
+SKIP = 1
+SHIFTS, RESERVED, ADDS, RECTIFY = 0x1F, 0x20, 0x40, 0x80
 MAX_LAYER_WIDTH = 1 << 16
 MAX_TENSORS = 256
 MAX_NAME_BYTES = 64
@@ -81,58 +84,86 @@ def decode_arrays(reader: FieldReader, shapes: Sequence[tuple[int, ...]]) -> lis
     return arrays
 
 
-def encode_networks(networks: dict[str, IntegerNetwork]) -> bytes:
+def encode_networks(networks: Sequence[IntegerNetwork]) -> bytes:
     """The entropy networks' section. Arrays in two halves: means and scales, in the last layer, differ in
     spread.
     """
     fields, arrays = [], []
-    for name in NETWORKS:
-        layers = networks[name].layers
+    for n, network in enumerate(networks):
+        layers = network.layers
         if len(layers) > MAX_LAYERS:
-            raise NotEncodable(f"{name} network: {len(layers)} layers, the format holds at most {MAX_LAYERS}")
-        fields.append(varint(len(layers)))
+            raise NotEncodable(f"network {n}: {len(layers)} layers, the format holds at most {MAX_LAYERS}")
+        fields.append(varint(len(layers)) + bytes([SKIP * network.skip]))
         for layer in layers:
             if max(layer.weight.shape) > MAX_LAYER_WIDTH:
-                raise NotEncodable(f"{name} network: a layer is wider than {MAX_LAYER_WIDTH}")
-            fields.append(varint(len(layer.bias)) + bytes([layer.shift | layer.rectify << 7]))
+                raise NotEncodable(f"network {n}: a layer is wider than {MAX_LAYER_WIDTH}")
+            flags = layer.shift | ADDS * layer.adds | RECTIFY * layer.rectify
+            fields.append(varint(len(layer.bias)) + bytes([flags]))
             arrays += np.array_split(layer.weight, 2) + np.array_split(layer.bias, 2)
     _check_count("entropy networks", arrays)
-    return b"".join(fields) + encode_arrays(arrays)
+    return b"".join(fields) + (encode_arrays(arrays) if arrays else b"")
 
 
 def decode_networks(
-    data: bytes, section: str, sizes: dict[str, tuple[int, int]]
-) -> dict[str, IntegerNetwork]:
-    """Inverse of `encode_networks`, given (inputs, outputs) of each network."""
+    data: bytes,
+    section: str,
+    sizes: Sequence[tuple[int, int]],
+    check_products: Callable[[int], None] = lambda products: None,
+) -> list[IntegerNetwork]:
+    """Inverse of `encode_networks`, given (inputs, outputs) of each network. `check_products` may refuse the number of
+    weights before any is decoded.
+    """
     reader = FieldReader(data, section)
-    plan: list[tuple[str, int, bool]] = []
+    plan: list[list[int]] = []  # of each network: flags of its layers
+    skips = []
     shapes: list[tuple[int, ...]] = []
-    for name in NETWORKS:
-        width, outputs = sizes[name]
-        for i in range(reader.varint(f"layers of the {name} network", 1, MAX_LAYERS)):
-            out = reader.varint(f"width of {name} layer {i}", 1, MAX_LAYER_WIDTH)
-            flags = reader.bytes(1, f"shift of {name} layer {i}")[0]
-            if flags & 0x7F > MAX_SHIFT:
+    for n, (inputs, outputs) in enumerate(sizes):
+        widths = [inputs]
+        count = reader.varint(f"layers of network {n}", 1, MAX_LAYERS)
+        skip = reader.bytes(1, f"flags of network {n}")[0]
+        if skip > SKIP or (skip and count == 1):
+            raise CorruptSection(
+                f"{section}: flags of network {n} are {skip}, expected 0, or with several layers 1"
+            )
+        plan.append([])
+        for i in range(count):
+            out = reader.varint(f"width of layer {i} of network {n}", 1, MAX_LAYER_WIDTH)
+            flags = reader.bytes(1, f"flags of layer {i} of network {n}")[0]
+            place = f"{section}: layer {i} of network {n}"
+            if flags & SHIFTS > MAX_SHIFT or flags & RESERVED:
                 raise CorruptSection(
-                    f"{section}: shift of {name} layer {i} is {flags & 0x7F}, expected 0 to {MAX_SHIFT}"
+                    f"{place}: flags are {flags:#04x}, expected a shift up to {MAX_SHIFT} and bit 5 zero"
                 )
-            plan.append((name, flags & 0x7F, bool(flags >> 7)))
+            if flags & ADDS and (i == 0 or i == count - 1 or widths[i - 1] != out):
+                raise CorruptSection(f"{place}: its outputs cannot be added to what the layer before takes")
+            taken = widths[-1] + (inputs if skip and i == count - 1 else 0)
+            plan[-1].append(flags)
             halves = (out - out // 2, out // 2)
-            shapes += [(halves[0], width), (halves[1], width), (halves[0],), (halves[1],)]
-            width = out
-        if width != outputs:
-            raise CorruptSection(f"{section}: the {name} network has {width} outputs, expected {outputs}")
+            shapes += [(halves[0], taken), (halves[1], taken), (halves[0],), (halves[1],)]
+            widths.append(out)
+        if widths[-1] != outputs:
+            raise CorruptSection(f"{section}: network {n} has {widths[-1]} outputs, expected {outputs}")
+        skips.append(bool(skip))
     _check_sizes(section, shapes)
-    arrays = decode_arrays(reader, shapes)
-    layers: dict[str, list[IntegerLayer]] = {name: [] for name in NETWORKS}
-    for i, (name, shift, rectify) in enumerate(plan):
-        weight = np.concatenate(arrays[4 * i : 4 * i + 2])
-        bias = np.concatenate(arrays[4 * i + 2 : 4 * i + 4]).astype(np.int64)
-        layers[name].append(IntegerLayer(weight, bias, shift, rectify))
-    try:
-        return {name: IntegerNetwork(tuple(layers[name])) for name in NETWORKS}
-    except ValueError as error:
-        raise CorruptSection(f"{section}: {error}") from error
+    check_products(sum(shape[0] * shape[1] for shape in shapes if len(shape) == 2))
+    if not sizes:
+        reader.end()
+        return []
+    arrays = iter(decode_arrays(reader, shapes))
+    networks = []
+    for flags_of_layers, with_skip in zip(plan, skips, strict=True):
+        layers = []
+        for flags in flags_of_layers:
+            weight = np.concatenate([next(arrays), next(arrays)])
+            bias = np.concatenate([next(arrays), next(arrays)]).astype(np.int64)
+            layers.append(
+                IntegerLayer(weight, bias, flags & SHIFTS, bool(flags & RECTIFY), bool(flags & ADDS))
+            )
+        try:
+            networks.append(IntegerNetwork(tuple(layers), with_skip))
+        except ValueError as error:
+            raise CorruptSection(f"{section}: {error}") from error
+    return networks
 
 
 def encode_heads(heads: Sequence[tuple[str, QuantizedTensor]]) -> bytes:
@@ -167,8 +198,10 @@ def encode_heads(heads: Sequence[tuple[str, QuantizedTensor]]) -> bytes:
     return b"".join(fields) + (encode_arrays(arrays) if arrays else b"")
 
 
-def decode_heads(data: bytes, section: str) -> tuple[tuple[str, QuantizedTensor], ...]:
-    """Inverse of `encode_heads`."""
+def decode_heads(
+    data: bytes, section: str, check_products: Callable[[int], None] = lambda products: None
+) -> tuple[tuple[str, QuantizedTensor], ...]:
+    """Inverse of `encode_heads`. `check_products` may refuse the number of weights before any is decoded."""
     reader = FieldReader(data, section)
     names: list[str] = []
     shapes: list[tuple[int, ...]] = []
@@ -191,6 +224,7 @@ def decode_heads(data: bytes, section: str) -> tuple[tuple[str, QuantizedTensor]
     if len(set(names)) < len(names):
         raise CorruptSection(f"{section}: two tensors have the same name")
     _check_sizes(section, shapes)
+    check_products(sum(math.prod(shape) for shape in shapes))
     if not names:
         reader.end()
         return ()

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy.conditional import code_latents
 from compgs.entropy.factorized import FactorizedDensity
-from compgs.entropy.network import NEGATIVE_SLOPE, OCTAVE, UNIT_SCALE, EntropyNetwork
+from compgs.entropy.network import EntropyNetwork, leaky
 from compgs.entropy.quantization import round_straight_through
 from compgs.linear import Reader, linear
 
@@ -40,7 +40,7 @@ class HyperAnalysis(nn.Module):
 
     def forward(self, y: Tensor) -> Tensor:
         first, second = self.first, self.second
-        hidden = nn.functional.leaky_relu(linear(y, first.weight.t(), first.bias), NEGATIVE_SLOPE)
+        hidden = leaky(linear(y, first.weight.t(), first.bias))
         return linear(hidden, second.weight.t(), second.bias)
 
 
@@ -66,33 +66,36 @@ class EntropyModel(nn.Module):
     def __init__(self, model: ModelConfig, entropy: EntropyConfig) -> None:
         super().__init__()
         residuals = model.coupled_primitives * model.residual_dim
-        hidden = entropy.network_hidden
-        self.own_residuals = model.residuals
+        shape = entropy.network_blocks, entropy.network_width
         self.reference_analysis = HyperAnalysis(model.reference_dim, entropy.reference_hyper_dim)
         self.reference_density = FactorizedDensity(entropy.reference_hyper_dim)
-        self.reference_network = EntropyNetwork(entropy.reference_hyper_dim, model.reference_dim, hidden)
+        self.reference_network = EntropyNetwork(entropy.reference_hyper_dim, model.reference_dim, *shape)
         # Log scales span a few natural units, that is dozens of steps.
         self.covariance_network = EntropyNetwork(
-            model.reference_dim, 6, hidden, 1.0 / entropy.covariance_step
+            model.reference_dim, 6, *shape, mean_gain=1.0 / entropy.covariance_step
         )
-        self.residual_analysis = HyperAnalysis(residuals, entropy.residual_hyper_dim)
-        self.residual_density = FactorizedDensity(entropy.residual_hyper_dim)
-        self.residual_network = EntropyNetwork(
-            entropy.residual_hyper_dim + model.reference_dim, residuals, hidden
-        )
-        self.log_covariance_step = nn.Parameter(torch.tensor(entropy.covariance_step).log())
-        with torch.no_grad():
-            self.residual_network.biases[-1][:residuals].uniform_(-SLOT_SPREAD, SLOT_SPREAD)
+        self.log_covariance_step = nn.Parameter(torch.full((6,), entropy.covariance_step).log())
+        self.residual_analysis: HyperAnalysis | None = None
+        self.residual_density: FactorizedDensity | None = None
+        self.residual_network: EntropyNetwork | None = None
+        if model.residuals:
+            hyper = model.coupled_primitives  # one channel for each (Ref.)
+            self.residual_analysis = HyperAnalysis(residuals, hyper)
+            self.residual_density = FactorizedDensity(hyper)
+            self.residual_network = EntropyNetwork(model.reference_dim + hyper, residuals, *shape)
+            with torch.no_grad():
+                self.residual_network.biases[-1][:residuals].uniform_(-SLOT_SPREAD, SLOT_SPREAD)
 
     @property
     def covariance_step(self) -> Tensor:
-        """s_Sigma: learned quantization step of the log scales (Sec. 3.4)."""
+        """s_Sigma [6]: learned quantization steps of the log scales (Sec. 3.4)."""
         return self.log_covariance_step.exp().clamp_min(SMALLEST_COVARIANCE_STEP)
 
     @property
     def coded_networks(self) -> tuple[EntropyNetwork, ...]:
         """The networks that the decoder needs, and so the file holds."""
-        return self.reference_network, self.covariance_network, self.residual_network
+        own = () if self.residual_network is None else (self.residual_network,)
+        return self.reference_network, self.covariance_network, *own
 
     def statistics(self) -> list[nn.Parameter]:
         """Parameters that say what latents cost, and nothing about what they are."""
@@ -110,15 +113,11 @@ class EntropyModel(nn.Module):
 
     def readers(self) -> Iterator[Reader]:
         """The layers that take the references."""
-        analysis, covariance, residual = (
-            self.reference_analysis.first,
-            self.covariance_network,
-            self.residual_network,
-        )
-        hyper = residual.weights[0].shape[1] - self.reference_network.channels
+        analysis = self.reference_analysis.first
         yield Reader(analysis.weight, analysis.bias, 1, 0, 1.0)
-        yield Reader(covariance.weights[0], covariance.biases[0], 1, 0, 1.0)
-        yield Reader(residual.weights[0], residual.biases[0], 1, hyper, 1.0)
+        yield from self.covariance_network.readers(0)
+        if self.residual_network is not None:
+            yield from self.residual_network.readers(0)
 
     @torch.no_grad()
     def restart_reference_scales(self, references: Tensor) -> tuple[nn.Parameter, nn.Parameter]:
@@ -134,26 +133,11 @@ class EntropyModel(nn.Module):
         bias[network.channels :] = torch.from_numpy(np.log2(np.maximum(spread, SMALLEST_SPREAD)))
         return weight, bias
 
-    def starting_residuals(self) -> Tensor:
-        """[K * residual_dim] residual embedding that a new anchor starts with, in quantization steps."""
-        channels = self.residual_network.channels
-        return self.residual_network.biases[-1].detach()[:channels].clone()
-
-    @torch.no_grad()
-    def expect_constant_residuals(self) -> None:
-        """Residual embeddings are what the last bias says, and cost nothing: the smallest scale."""
-        network = self.residual_network
-        means = network.biases[-1][: network.channels].clone()
-        for parameter in network.parameters():
-            parameter.requires_grad_(False).zero_()
-        network.biases[-1][: network.channels] = means
-        network.biases[-1][network.channels :] = -UNIT_SCALE / OCTAVE
-
     def forward(
         self,
         references: Tensor,  # [N, reference_dim] steps
         covariances: Tensor,  # [N, 6] log scales over the covariance step
-        residuals: Tensor,  # [N, K * residual_dim] steps; [1, K * residual_dim] if all anchors share them
+        residuals: Tensor,  # [N, K * residual_dim] steps; [1, K * residual_dim] if all anchors share them, uncoded
         *,
         rate: bool,
         noise: Callable[[Tensor], Tensor] | None = None,
@@ -174,17 +158,25 @@ class EntropyModel(nn.Module):
             "reference": bits_f,
             "covariance": bits_c,
         }
-        if self.own_residuals:
-            z_g = self.residual_analysis(residuals)
-            context = torch.cat([round_straight_through(z_g), f_hat], 1)
-            g_hat, bits_g = code(residuals, context, self.residual_network, mask=mask)
-            hyper = _hyper_bits(self.residual_density, z_g, noise) if rate else bits_g
-            bits |= {"residual_hyper": hyper, "residual": bits_g}
-        else:  # one row, whatever the context: the network's weights are zero
-            context = residuals.new_zeros(1, self.residual_network.weights[0].shape[1])
-            shared, _ = code(residuals, context, self.residual_network, rate=False)
-            g_hat = shared.expand(len(f_hat), -1)
+        if self.residual_network is None:
+            return Quantized(f_hat, c_hat, residuals.expand(len(f_hat), -1), bits if rate else {})
+        assert self.residual_analysis is not None and self.residual_density is not None
+        z_g = self.residual_analysis(residuals)
+        context = torch.cat([f_hat, round_straight_through(z_g)], 1)
+        g_hat, bits_g = code(residuals, context, self.residual_network, mask=mask)
+        hyper = _hyper_bits(self.residual_density, z_g, noise) if rate else bits_g
+        bits |= {"residual_hyper": hyper, "residual": bits_g}
         return Quantized(f_hat, c_hat, g_hat, bits if rate else {})
+
+
+def starting_residuals(entropy: EntropyModel, model: ModelConfig) -> Tensor:
+    """[K * residual_dim] residual embeddings that a new anchor starts with, in quantization steps: what the prior
+    expects; where all anchors share them, what training starts from.
+    """
+    network = entropy.residual_network
+    if network is not None:
+        return network.biases[-1].detach()[: network.channels].clone()
+    return torch.empty(model.coupled_primitives * model.residual_dim).uniform_(-SLOT_SPREAD, SLOT_SPREAD)
 
 
 def _hyper_bits(density: FactorizedDensity, z: Tensor, noise: Callable[[Tensor], Tensor] | None) -> Tensor:

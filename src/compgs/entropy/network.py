@@ -1,13 +1,13 @@
 """The trainable twin of the codec's integer networks."""
 
-import itertools
 import math
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor, nn
 
 from compgs.entropy.quantization import quantize_weight, round_straight_through
-from compgs.linear import linear
+from compgs.linear import Reader, linear
 
 # A power of two, so that the decoder's leaky ReLU is a shift.
 NEGATIVE_SLOPE = 2.0**-6
@@ -29,23 +29,31 @@ def round_fixed(x: Tensor) -> Tensor:
 class EntropyNetwork(nn.Module):
     """Means and scale indices of C Gaussian-distributed symbols from already decoded latents (CompGS Sec. 3.3).
 
-        x [N, inputs] ─► linear ─► (leaky ReLU ─► linear) ... ─► mean [N, C], scale index [N, C]
+    Without blocks one linear layer; with them a residual multi-layer perceptron (Sec. 3.4):
 
-    `mean_gain` sets the unit in which the means are learned, so that one learning rate serves embeddings (means of
-    a few steps) and log scales (means of dozens of steps). Gains are folded into the last layer: `layers` gives the
-    weights that the file will hold, and with `bits` everything is rounded as the decoder rounds it.
+        x [N, inputs] ─► linear ─► leaky ReLU ─► h
+        blocks times:     h ─► h + linear(leaky ReLU(linear(h)))
+        [h, x] ─► linear ─► mean [N, C], scale index [N, C]
+
+    The last layer takes the input too: that is the linear skip, in the same sum of products. `mean_gain` sets the unit
+    in which the means are learned, so that one learning rate serves embeddings (means of a few steps) and log scales
+    (means of dozens of steps). Gains are folded into the last layer: `layers` gives the weights that the file will
+    hold, and with `bits` everything is rounded as the decoder rounds it.
     """
 
     gain: Tensor
     offset: Tensor
 
-    def __init__(self, inputs: int, channels: int, hidden: int = 0, mean_gain: float = 1.0) -> None:
+    def __init__(
+        self, inputs: int, channels: int, blocks: int = 0, width: int = 0, mean_gain: float = 1.0
+    ) -> None:
         super().__init__()
-        sizes = [inputs, hidden, 2 * channels] if hidden else [inputs, 2 * channels]
+        hidden = [(inputs, width), *[(width, width)] * (2 * blocks)] if blocks else []
         self.channels = channels
+        self.blocks = blocks
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
-        for n_in, n_out in itertools.pairwise(sizes):
+        for n_in, n_out in [*hidden, (inputs + (width if blocks else 0), 2 * channels)]:
             bound = 1.0 / math.sqrt(n_in)
             self.weights.append(nn.Parameter(torch.empty(n_out, n_in).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.zeros(n_out)))
@@ -55,6 +63,13 @@ class EntropyNetwork(nn.Module):
         offset[channels:] = UNIT_SCALE
         self.register_buffer("gain", gain)
         self.register_buffer("offset", offset)
+
+    def readers(self, first: int) -> Iterator[Reader]:
+        """The layers that take the input; what is meant begins at its channel `first`."""
+        yield Reader(self.weights[0], self.biases[0], 1, first, 1.0)
+        if self.blocks:
+            skip = len(self.biases[0]) + first
+            yield Reader(self.weights[-1], self.biases[-1], 1, skip, 1.0)
 
     def keep_channels(self, kept: Tensor) -> None:
         """Follow the last layer's weights and biases, which have lost the rows of all channels but those `kept` [C]."""
@@ -75,12 +90,19 @@ class EntropyNetwork(nn.Module):
         return result
 
     def inputs_of_last(self, x: Tensor, bits: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """x [N, inputs] through all layers but the last; then the last one's weight [2 C, in] and bias [2 C]."""
+        """What the last layer takes of x [N, inputs], and its weight [2 C, in] and bias [2 C]."""
         *hidden, (weight, bias) = self.layers(bits)
-        for hidden_weight, hidden_bias in hidden:
-            y = linear(x, hidden_weight.t(), hidden_bias)
-            x = nn.functional.leaky_relu(y if bits is None else round_fixed(y), NEGATIVE_SLOPE)
-        return x, weight, bias
+        if not hidden:
+            return x, weight, bias
+
+        def affine(h: Tensor, layer: tuple[Tensor, Tensor]) -> Tensor:
+            y = linear(h, layer[0].t(), layer[1])
+            return y if bits is None else round_fixed(y)
+
+        h = leaky(affine(x, hidden[0]))
+        for first, second in zip(hidden[1::2], hidden[2::2], strict=True):
+            h = h + affine(leaky(affine(h, first)), second)
+        return torch.cat([h, x], 1), weight, bias
 
     def forward(self, x: Tensor, bits: int | None = None) -> tuple[Tensor, Tensor]:
         """x [N, inputs] -> means [N, C] in quantization steps, scale indices [N, C] (see entropy.gaussian)."""
@@ -88,3 +110,8 @@ class EntropyNetwork(nn.Module):
         y = torch.addmm(bias, x, weight.t())
         mean, scale = (y if bits is None else round_fixed(y)).chunk(2, 1)
         return mean, scale
+
+
+def leaky(x: Tensor) -> Tensor:
+    """Leaky ReLU with the decoder's slope."""
+    return nn.functional.leaky_relu(x, NEGATIVE_SLOPE)

@@ -25,6 +25,8 @@ from compgs.model.fused import PairedPrediction
 from compgs.model.layers import ResidualMLP
 from compgs.model.primitives import Primitives
 
+# Name, in a file, of the residual embeddings [K, residual_dim] that all anchors share where none has its own.
+SHARED_RESIDUALS = "residuals"
 VIEW_DIM = 4  # unit direction (3) and distance (1)
 OPACITY_CUTOFF = 1.0 / 255.0  # a splat below it touches no pixel in any rasterizer
 OPACITY_BIAS = 0.15  # where opacity starts at or below zero no gradient flows

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
+from compgs.entropy.models import starting_residuals
 from compgs.model.prediction import Prediction
 from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import replace_rows
@@ -178,7 +179,7 @@ class AdaptiveControl:
             "coordinates": rows["coordinates"].to(torch.int32),
             "references": rows["references"],
             "log_scales": rows["log_scales"],
-            "residuals": model.entropy.starting_residuals().repeat(new, 1),
+            "residuals": starting_residuals(model.entropy, m).repeat(new, 1),
             "mask": model.mask.new_ones(new, m.coupled_primitives),
         }
 

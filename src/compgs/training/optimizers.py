@@ -20,6 +20,8 @@ ADAM_EPSILON = 1e-15  # gradients of single primitives are tiny (3DGS)
 def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.Adam:
     """Groups carry their name and (first, last) learning rate; `set_learning_rates` moves between them."""
     heads, entropy = model.heads, model.entropy
+    longer = max(1.0, config.entropy_lr_steps / config.steps)
+    entropy_lr = config.entropy_lr[0] * longer, config.entropy_lr[1] * longer
 
     def group(name: str, parameters: Iterable[nn.Parameter], rates: tuple[float, float]) -> dict:
         return {"name": name, "params": list(parameters), "lr": rates[0], "rates": rates}
@@ -28,7 +30,7 @@ def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.A
         group("log_scales", [model.log_scales], config.log_scale_lr),
         group("references", [model.references], config.embedding_lr),
         group("residuals", [model.residuals], config.embedding_lr),
-        group("entropy", entropy.parameters(), config.entropy_lr),
+        group("entropy", entropy.parameters(), entropy_lr),
     ]
     if heads.layout == "paired":
         groups.append(group("geometry", heads.geometry.parameters(), config.covariance_lr))

@@ -185,8 +185,6 @@ class Trainer:
         set_learning_rates(self.optimizer, progress, DECAYS[t.schedule], t.head_warm_up)
         self.optimizer_step(rows)
         self.optimizer.zero_grad(set_to_none=True)
-        if not self.config.model.residuals:
-            self.model.share_residuals()
         profile.lap("optimizer")
         if self.schedule.active(self.step):
             gradient = rendered.means2d.grad
@@ -274,7 +272,7 @@ class Trainer:
         """Coded symbols of each stream, of an anchor."""
         m, e = self.config.model, self.config.entropy
         own = {
-            "residual_hyper": e.residual_hyper_dim,
+            "residual_hyper": m.coupled_primitives,
             "residual": m.coupled_primitives * m.residual_dim,
         }
         return {

@@ -1,0 +1,114 @@
+"""The latents of a range of octree levels, group after group: a pair of encode and decode.
+
+A file has one section of these for each range, coarse to fine, so that its beginning is a coarse scene. Nothing in a
+range depends on another range but, with contexts that see coordinates, on the positions of all anchors.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from compgs.codec.anchor_order import MAXIMUM_DEPTH
+from compgs.codec.content import (
+    Dimensions,
+    Group,
+    Role,
+    conditional_tables,
+    existing_symbols,
+    fixed_point,
+    reconstruct,
+)
+from compgs.codec.fields import FieldReader, varint
+from compgs.codec.format import LATENTS, MAX_ANCHORS, MAX_COUPLED_PRIMITIVES, MAX_SYMBOL, SECTION_NAMES
+from compgs.codec.integer_network import IntegerNetwork
+from compgs.codec.rans import encode_symbols, read_symbols, skip_symbols
+from compgs.codec.tables import HyperTable
+from compgs.errors import CorruptSection
+
+Prior = IntegerNetwork | tuple[HyperTable, ...]
+
+# The least anchors of a file for each further range: what a range adds, some thirty bytes, then stays below 1 % of the
+# ten bytes or so of an anchor.
+ANCHORS_PER_RANGE = 350
+MOST_RANGES = 8  # that an encoder makes: each has at least half of the anchors of all before it
+
+
+@dataclass(frozen=True)
+class RangeHead:
+    """What a range's section begins with."""
+
+    level: int  # of the octree: the last one of the range
+    anchors: int  # of the range
+    coupled: int  # coupled primitives of these that exist
+
+
+def chosen_levels(counts: np.ndarray) -> list[int]:
+    """Last level of each range an encoder makes, from `anchor_order.level_counts` [depth + 1]: every range but the
+    first has at least as many anchors as all before it.
+    """
+    total = int(counts[-1])
+    ends = [len(counts) - 1]
+    most = min(MOST_RANGES, 1 + total // ANCHORS_PER_RANGE)
+    for level in range(len(counts) - 2, -1, -1):
+        if len(ends) == most:
+            break
+        if 2 * counts[level] <= counts[ends[-1]]:
+            ends.append(level)
+    return ends[::-1]
+
+
+def encode_range(
+    level: int,
+    groups: Sequence[Group],  # of the range's anchors
+    mask: np.ndarray,  # [n, K] bool
+    places: np.ndarray,  # [n, 3] `content.coordinate_context`
+) -> bytes:
+    """The section of n anchors."""
+    parts = [bytes([level]), varint(len(mask)), varint(int(mask.sum()))]
+    latents: list[np.ndarray] = []
+    for group in groups:
+        means, index, tables = conditional_tables(group, group.prior, latents, places, mask)
+        symbols = existing_symbols(group, mask)
+        parts.append(encode_symbols(symbols.ravel(), index.ravel(), tables))
+        latents.append(fixed_point(symbols) if means is None else reconstruct(symbols, means))
+    return b"".join(parts)
+
+
+def read_head(reader: FieldReader) -> RangeHead:
+    level = reader.varint("level", 0, MAXIMUM_DEPTH)
+    anchors = reader.varint("anchors", 1, MAX_ANCHORS)
+    return RangeHead(level, anchors, reader.varint("coupled", 0, anchors * MAX_COUPLED_PRIMITIVES))
+
+
+def decode_range(
+    reader: FieldReader,  # behind the head
+    dimensions: Dimensions,
+    priors: Sequence[Prior],
+    mask: np.ndarray,  # [n, K] bool
+    places: np.ndarray,  # [n, 3]
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Symbols (int32) and latents (int32, Q12) of each group, [n, channels] or with RESIDUAL [p, channels]."""
+    latents: list[np.ndarray] = []
+    all_symbols: list[np.ndarray] = []
+    for shape, prior in zip(dimensions.groups, priors, strict=True):
+        means, index, tables = conditional_tables(shape, prior, latents, places, mask)
+        symbols = read_symbols(reader, index.ravel(), tables).reshape(index.shape)
+        if symbols.size and (symbols.min() < -MAX_SYMBOL or symbols.max() > MAX_SYMBOL):
+            raise CorruptSection(f"{reader.section}: a symbol is not in -{MAX_SYMBOL} to {MAX_SYMBOL}")
+        latents.append(fixed_point(symbols) if means is None else reconstruct(symbols, means))
+        all_symbols.append(symbols)
+    reader.end()
+    return all_symbols, latents
+
+
+def stream_sizes(data: bytes, dimensions: Dimensions) -> tuple[RangeHead, list[int]]:
+    """Bytes of each group in a range's section; nothing is decoded."""
+    reader = FieldReader(data, SECTION_NAMES[LATENTS])
+    head = read_head(reader)
+    sizes = []
+    for shape in dimensions.groups:
+        rows = head.coupled if shape.role == Role.RESIDUAL else head.anchors
+        sizes.append(skip_symbols(reader, rows * shape.channels))
+    reader.end()
+    return head, sizes
