@@ -66,25 +66,40 @@ class EntropyConfig:
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """Adaptive control of the anchors: growth and pruning (Ref.; schedule as fractions of the run)."""
+    """Adaptive control of the anchors: growth and pruning (Ref.); schedule and short runs: `training/control.py`."""
 
     start: float = 0.15  # of the steps: first control
-    stop: float = 0.5  # of the steps: last control
-    every: float = 0.05  # of the steps between two controls, at least twice the number of views
+    # passes over the training views, after which the first control comes if that is earlier (Ref.: 5)
+    start_passes: float | None = None
+    stop: float = 0.5  # of the steps: no control from here on (Ref.)
+    every: float = 0.05  # of the steps between two controls, at least one pass over the training views
+    # passes over the training views between two controls, if these are fewer steps (Ref.: 2)
+    every_passes: float | None = None
+    # passes over the training views before statistics are gathered, if the first control leaves the time (Ref.: 3)
+    observe_passes: float = 0.0
     gradient_threshold: float = 1e-4  # mean norm of the 2D gradient, in units of half the image
     rate_exponent: float = (
         1 / 3  # threshold and pruned share grow with this power of lambda / 0.002: anchors cost bits
     )
-    minimum_views: int = 20  # a primitive seen less often is not judged
+    minimum_views: int = 20  # a primitive seen less often is not judged (Ref.: more than 40), ...
+    # ... unless it was seen in this share of the steps between two controls: where these are few, no primitive is seen
+    # 40 times. Above 1 it takes several controls, and needs statistics that outlast them (`reset_all` false).
+    minimum_share: float = 2.0
     opacity_threshold: float = (
         5e-4  # anchors with less opacity, summed over K, averaged over views, are removed
     )
+    opacity_views: int = 5  # an anchor in view less often is not removed for its opacity (Ref.: 1) ...
+    opacity_share: float = 0.1  # ... nor in a smaller share of the steps between two controls (Ref.: 0)
+    reset_all: bool = False  # after a control all statistics start anew (Ref.: true), else of what was judged
+    # with which a candidate for a cell of 16, 4, 1 voxels is kept (Ref.: 0.5, 0.75, 0.875)
+    growth_probabilities: tuple[float, float, float] = (0.5, 0.25, 0.125)
+    # cells of 4 and 1 voxels are tried only in a control that has grown anchors in larger ones (Ref.: true)
+    finer_needs_coarser: bool = False
     idle_share: float = (
         0.002  # of all blending weights in training views: what adds no more is left out of the file
     )
     prune_at: tuple[float, ...] = (0.5, 0.6, 0.7)  # of the steps: the anchors that add least are removed
     prune_share: float = 0.02  # of all blending weights in training views, that go each time
-    growth_probability: float = 0.5  # a candidate of level l is kept with probability p^(l + 1)
 
 
 @dataclass(frozen=True)
@@ -247,16 +262,28 @@ def check_config(config: Config) -> None:
         ("training.appearance_dtype", t.appearance_dtype in ("float32", "bfloat16"), "float32 or bfloat16"),
         ("training.checkpoint_minutes", 0 < t.checkpoint_minutes < 1e6, "above 0"),
         ("control.start", 0 <= c.start <= 1, "0 to 1"),
+        ("control.start_passes", c.start_passes is None or 0 < c.start_passes < 1e6, "above 0"),
         ("control.stop", 0 <= c.stop <= 1, "0 to 1"),
         ("control.every", 0 < c.every <= 1, "above 0, up to 1"),
+        ("control.every_passes", c.every_passes is None or 0 < c.every_passes < 1e6, "above 0"),
+        ("control.observe_passes", 0 <= c.observe_passes < 1e6, "0 or more"),
         ("control.gradient_threshold", 0 < c.gradient_threshold < 1e6, "above 0"),
         ("control.rate_exponent", 0 <= c.rate_exponent <= 2, "0 to 2"),
         ("control.minimum_views", 0 <= c.minimum_views < 1 << 31, "0 or more"),
+        ("control.minimum_share", 0 < c.minimum_share < 1e6, "above 0"),
         ("control.opacity_threshold", 0 <= c.opacity_threshold < 1e3, "0 or more"),
+        ("control.opacity_views", 1 <= c.opacity_views < 1 << 31, "1 or more"),
+        ("control.opacity_share", 0 <= c.opacity_share < 1e6, "0 or more"),
+        ("control.reset_all", isinstance(c.reset_all, bool), "true or false"),
         ("control.idle_share", 0 <= c.idle_share < 1, "0 or more, below 1"),
         ("control.prune_at", all(0 <= at <= 1 for at in c.prune_at), "numbers from 0 to 1"),
         ("control.prune_share", 0 <= c.prune_share < 1, "0 or more, below 1"),
-        ("control.growth_probability", 0 <= c.growth_probability <= 1, "0 to 1"),
+        (
+            "control.growth_probabilities",
+            len(c.growth_probabilities) == 3 and all(0 <= p <= 1 for p in c.growth_probabilities),
+            "three numbers from 0 to 1",
+        ),
+        ("control.finer_needs_coarser", isinstance(c.finer_needs_coarser, bool), "true or false"),
         ("splats.harmonics", 0 <= s.harmonics <= 3, "0 to 3"),
         ("splats.harmonics_every", 0 <= s.harmonics_every <= 1, "0 to 1"),
         ("splats.initial_opacity", 0 < s.initial_opacity < 1, "above 0, below 1"),

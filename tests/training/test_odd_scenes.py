@@ -271,7 +271,7 @@ def test_anchors_that_all_ask_for_more_keep_to_the_limit(config: Config) -> None
     eager = replace(
         config,
         model=replace(config.model, max_anchors=limit),
-        control=replace(config.control, gradient_threshold=1e-9, growth_probability=1.0),
+        control=replace(config.control, gradient_threshold=1e-9, growth_probabilities=(1.0, 1.0, 1.0)),
     )
     scene = portrait()
     trainer = Trainer(scene, eager, CPU)

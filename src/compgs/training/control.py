@@ -1,8 +1,17 @@
 """Adaptive control of the anchors: growth where the image still pulls, pruning where nothing is seen.
 
 The paper leaves it to Scaffold-GS (Lu et al. 2023): coupled primitives whose 2D means keep a large gradient ask for new
-anchors on three grids of 16, 4 and 1 voxels; anchors whose primitives are transparent are removed. Schedules are
-fractions of the run, so that short and long runs go through the same phases.
+anchors on three grids of 16, 4 and 1 voxels; anchors whose primitives are transparent are removed.
+
+The schedule is fractions of the run, so that short and long runs go through the same phases. The authors' release
+counts passes over the V training views instead: statistics from 3 V steps on, control from 5 V, every 2 V, until half
+of 30 000 steps. So passes can be given, too (`start_passes`, `every_passes`, `observe_passes`), and what comes first
+holds. With the `paper` preset 30 000 steps over 100 views and more go as published. A run too short for that keeps the
+fractions: seven controls, or as many as there is a whole pass for before each.
+
+In few steps a primitive cannot be seen often. The published minimum of more than 40 sightings between two controls,
+2 V steps apart, would never judge what fewer than 21 views show. So a share of the steps between two controls is
+enough (`minimum_share`). From 103 views on, a fifth of 2 V steps is no less than the published minimum.
 """
 
 from dataclasses import dataclass
@@ -23,28 +32,53 @@ GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
 # below 1e-6 more anchors took half as many bytes again and brought nothing (docs/results/experiments.md, fifth series)
 USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 COORDINATE_LIMIT = 1 << 20  # voxels: what the octree coder can hold
+# Steps: with fewer views than that, passes are counted as if there were as many, or control would come every few steps.
+# The published scenes have 109 training views and more.
+SHORTEST_PASS = 100
 
 
 @dataclass(frozen=True)
 class ControlSchedule:
-    """Steps at which control acts: `start`, then every `every` until `stop`."""
+    """Steps, counted from 0, after which control acts: `start`, then every `every` before `stop`.
+
+    Statistics are gathered from step `observe` on, `stop` excluded.
+    """
 
     start: int
     stop: int
     every: int
+    observe: int = 0
 
     def active(self, step: int) -> bool:
         """Statistics are gathered in this step."""
-        return step < self.stop
+        return self.observe <= step < self.stop
 
     def due(self, step: int) -> bool:
         return self.start <= step < self.stop and (step - self.start) % self.every == 0
 
+    def ended(self, step: int) -> bool:
+        """There is no control from this step on."""
+        return step >= self.stop
+
 
 def make_schedule(config: ControlConfig, steps: int, views: int) -> ControlSchedule:
-    """Fractions of the run in steps; every view is seen about once between two controls."""
-    every = max(1, round(config.every * steps), views)
-    return ControlSchedule(max(1, round(config.start * steps)), round(config.stop * steps), every)
+    """Fractions of the run in steps, or passes over the views where these end earlier; see the module's docstring.
+
+    Between two controls every view is seen about once, at least. Statistics begin early enough for the first control
+    to judge as many steps as the others.
+    """
+    start, every = round(config.start * steps), round(config.every * steps)
+    if config.start_passes is not None:  # Steps count from 0: the last of n passes is step n V - 1.
+        start = min(start, _pass_steps(config.start_passes, views) - 1)
+    if config.every_passes is not None:
+        every = min(every, _pass_steps(config.every_passes, views))
+    start, every = max(1, start), max(1, every, views)
+    observe = min(_pass_steps(config.observe_passes, views), start + 1 - every)
+    return ControlSchedule(start, round(config.stop * steps), every, max(0, observe))
+
+
+def _pass_steps(passes: float, views: int) -> int:
+    return round(passes * max(views, SHORTEST_PASS))
 
 
 def rate_weight(config: ControlConfig, lmbda: float) -> float:
@@ -91,25 +125,31 @@ class AdaptiveControl:
         lmbda: float,
     ) -> None:
         """Grow and prune. means: [N, K, 3] of all coupled primitives, world units; lmbda: the rate's present weight."""
-        c, n = self.config.control, model.anchors
-        judged = self.drawn >= min(c.minimum_views, 2 * self.schedule.every)
-        mean_gradient = self.gradient / self.drawn.clamp_min(1)
-        added = self._grow(model, means, torch.where(judged, mean_gradient, 0.0), noise, lmbda)
-        self.gradient[judged] = 0
-        self.drawn[judged] = 0
+        c, n, every = self.config.control, model.anchors, self.schedule.every
+        judged = self.drawn >= min(c.minimum_views, int(c.minimum_share * every))
+        gradient = torch.where(judged, self.gradient / self.drawn.clamp_min(1), 0.0)
+        added = self._grow(model, means, gradient, noise, lmbda)
 
-        ripe = self.seen >= max(5, self.schedule.every // 10)
+        ripe = self.seen >= max(c.opacity_views, int(c.opacity_share * every))
         transparent = self.opacity / self.seen.clamp_min(1) < c.opacity_threshold
         kept = ~(ripe & transparent)
         if not kept.any():
             kept[:] = True
-        self.opacity[ripe] = 0
-        self.seen[ripe] = 0
+        self._start_anew(judged, ripe)
 
         new = len(added["coordinates"])
         if new or not kept.all():
             self._replace(model, optimizer, kept, added)
         assert model.anchors == int(kept.sum()) + new and len(kept) == n
+
+    def _start_anew(self, judged: Tensor, ripe: Tensor) -> None:
+        """Zero statistics of the `judged` primitives [N, K] and the `ripe` anchors [N], bool, or of all."""
+        if self.config.control.reset_all:
+            judged, ripe = torch.ones_like(judged), torch.ones_like(ripe)
+        self.gradient[judged] = 0
+        self.drawn[judged] = 0
+        self.opacity[ripe] = 0
+        self.seen[ripe] = 0
 
     @torch.no_grad()
     def keep(self, model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor) -> None:
@@ -132,56 +172,70 @@ class AdaptiveControl:
     def _grow(
         self, model: TrainedModel, means: Tensor, gradient: Tensor, noise: torch.Generator, lmbda: float
     ) -> dict[str, Tensor]:
-        """New anchors by name of their parameter. gradient: [N, K], 0 where not judged."""
-        c, m = self.config.control, self.config.model
+        """New anchors by name of their parameter. gradient: [N, K] mean norms, 0 where not judged."""
+        c, k = self.config.control, self.config.model.coupled_primitives
         flat = gradient.view(-1)
         target = torch.round(means.view(-1, 3) / model.voxel_size)
+        inside = (target.abs() < COORDINATE_LIMIT - 16).all(1)
         taken = model.coordinates.to(torch.int64)
-        room = m.max_anchors - model.anchors
+        room = max(0, self.config.model.max_anchors - model.anchors)
         threshold = c.gradient_threshold * rate_weight(c, lmbda)
-        grown: dict[str, list[Tensor]] = {name: [] for name in ("coordinates", "references", "log_scales")}
-        for level, (factor, size) in enumerate(GROWTH_LEVELS):
-            asks = flat >= threshold * factor
-            asks &= torch.rand(len(flat), generator=noise, device=flat.device) < c.growth_probability ** (
-                level + 1
-            )
-            asks &= (target.abs() < COORDINATE_LIMIT - 16).all(1)
-            slots = torch.nonzero(asks).view(-1)
-            if len(slots) == 0 or room <= 0:
+        coordinates, references = [taken[:0]], [model.references.detach()[:0]]
+        log_scales = [means.new_zeros(0, 6)]
+        for level, ((factor, size), probability) in enumerate(
+            zip(GROWTH_LEVELS, c.growth_probabilities, strict=True)
+        ):
+            if c.finer_needs_coarser and level > 0 and len(taken) == model.anchors:
+                break
+            chance = torch.rand(len(flat), generator=noise, device=flat.device)
+            slots = torch.nonzero((flat >= threshold * factor) & (chance < probability) & inside).view(-1)
+            if len(slots) == 0 or room == 0:
                 continue
-            cells = _cell(target[slots].to(torch.int64), size)
-            occupied = torch.unique(_key(_cell(taken, size)))
-            key = _key(cells)
-            free = ~torch.isin(key, occupied)
-            slots, cells, key = slots[free], cells[free], key[free]
-            unique, inverse = torch.unique(key, return_inverse=True)
-            if len(unique) == 0:
-                continue
-            first = torch.full_like(unique, len(key))
-            first.scatter_reduce_(0, inverse, torch.arange(len(key), device=key.device), "amin")
-            chosen = cells[first] * size
-            parents = model.references.detach()[slots // m.coupled_primitives]
-            references = parents.new_full((len(unique), model.reference_dim), -torch.inf)
-            references.scatter_reduce_(0, inverse[:, None].expand_as(parents), parents, "amax")
-            grown["coordinates"].append(chosen[:room])
-            grown["references"].append(references[:room])
-            grown["log_scales"].append(references.new_full((len(unique), 6), float(size)).log()[:room])
-            taken = torch.cat([taken, chosen[:room]])
-            room -= len(chosen[:room])
-        new = sum(len(x) for x in grown["coordinates"])
-        empty = {
-            "coordinates": (0, 3),
-            "references": (0, model.reference_dim),
-            "log_scales": (0, 6),
-        }
-        rows = {name: torch.cat([*parts, means.new_zeros(empty[name])]) for name, parts in grown.items()}
+            cells, asked = new_cells(target[slots].to(torch.int64), flat[slots], taken, size, room)
+            parents = model.references.detach()[slots[asked >= 0] // k]
+            coordinates.append(cells)
+            references.append(largest(parents, asked[asked >= 0], len(cells)))
+            log_scales.append(means.new_full((len(cells), 6), float(size)).log())
+            taken = torch.cat([taken, cells])
+            room -= len(cells)
+        new = len(taken) - model.anchors
         return {
-            "coordinates": rows["coordinates"].to(torch.int32),
-            "references": rows["references"],
-            "log_scales": rows["log_scales"],
-            "residuals": starting_residuals(model.entropy, m).repeat(new, 1),
-            "mask": model.mask.new_ones(new, m.coupled_primitives),
+            "coordinates": torch.cat(coordinates).to(torch.int32),
+            "references": torch.cat(references),
+            "log_scales": torch.cat(log_scales),
+            "residuals": starting_residuals(model.entropy, self.config.model).repeat(new, 1),
+            "mask": model.mask.new_ones(new, k),
         }
+
+
+def new_cells(
+    target: Tensor,  # [C, 3] int64 voxels, where candidates are
+    gradient: Tensor,  # [C] how much the image pulls at them
+    taken: Tensor,  # [N, 3] int64 voxels, anchors that there are
+    size: int,  # voxels to a cell of the grid
+    room: int,  # new anchors that are allowed
+) -> tuple[Tensor, Tensor]:
+    """Cells of the grid that candidates ask for and no anchor is in, as [A, 3] int64 voxels of their centres, and for
+    each candidate which of them it asked for, [C] int64, -1: none.
+
+    If all would be too many, those with the largest gradient of a candidate, wherever they are.
+    """
+    key = _key(_cell(target, size))
+    free = ~torch.isin(key, _key(_cell(taken, size)))
+    unique, inverse = torch.unique(key[free], return_inverse=True)
+    strongest = gradient.new_zeros(len(unique)).scatter_reduce_(0, inverse, gradient[free], "amax")
+    chosen = torch.sort(strongest, descending=True, stable=True).indices[:room].sort().values
+    place = torch.full_like(unique, -1)
+    place[chosen] = torch.arange(len(chosen), device=place.device)
+    asked = torch.full_like(key, -1)
+    asked[free] = place[inverse]
+    return _cell_of(unique[chosen]) * size, asked
+
+
+def largest(rows: Tensor, group: Tensor, groups: int) -> Tensor:
+    """[groups, C]: element-wise maximum of the rows [R, C] of each group [R] int64; none is empty."""
+    result = rows.new_full((groups, rows.shape[1]), -torch.inf)
+    return result.scatter_reduce_(0, group[:, None].expand_as(rows), rows, "amax")
 
 
 def _cell(coordinates: Tensor, size: int) -> Tensor:
@@ -193,3 +247,9 @@ def _key(cells: Tensor) -> Tensor:
     """One int64 a cell, 21 bits an axis."""
     shifted = cells + COORDINATE_LIMIT
     return (shifted[:, 0] << 42) | (shifted[:, 1] << 21) | shifted[:, 2]
+
+
+def _cell_of(key: Tensor) -> Tensor:
+    """Inverse of `_key`: [N, 3] int64."""
+    mask = (1 << 21) - 1
+    return torch.stack([key >> 42, (key >> 21) & mask, key & mask], 1) - COORDINATE_LIMIT

@@ -347,7 +347,7 @@ class Trainer:
         t = self.config.training
         if t.target_bytes is None or not due(self.step, t.steps, t.rate_start):
             return
-        grown = not self.schedule.active(self.step)
+        grown = self.schedule.ended(self.step)
         fixed = self.fixed_bytes()
         size = self.estimated_bytes() - fixed
         pruned = any(self.step - t.steps // LOOKS <= at < self.step for at in self.pruned_at)
