@@ -183,6 +183,21 @@ def test_a_run_gathers_statistics_only_when_the_schedule_says_so(blob_scene, tin
         assert bool(trainer.control.seen.any()) == gathered
 
 
+def test_a_short_run_of_the_paper_preset_grows_and_prunes(blob_scene, tiny_config):
+    control = replace(PAPER, gradient_threshold=1e-6, opacity_threshold=0.2)
+    config = replace(tiny_config, control=control, training=replace(tiny_config.training, steps=100))
+    trainer = Trainer(blob_scene, config, CPU)
+    grown, gone = 0, 0
+    while not trainer.schedule.ended(trainer.step):
+        before = trainer.model.coordinates
+        trainer.train_step()
+        after = trainer.model.coordinates
+        if len(after) != len(before):
+            lost = len(torch.unique(torch.cat([before, after]), dim=0)) - len(after)
+            gone, grown = gone + lost, grown + len(after) - (len(before) - lost)
+    assert grown > 0 and gone > 0
+
+
 def test_a_size_is_followed_gently_before_statistics_are_gathered(blob_scene, tiny_config, monkeypatch):
     """Anchors are still to come then: `grown` is false."""
     config = replace(tiny_config, training=replace(tiny_config.training, target_bytes=10**6, rate_start=0.0))
@@ -327,15 +342,17 @@ FAR = [[203, 0, 0], [203, 0, 0]]
 
 
 @pytest.mark.parametrize(
-    ("waits", "gradients", "expected"),
+    ("preset", "gradients", "expected"),
     [
-        (False, [[100.0, 0.0], [0.0, 0.0]], [([4, 0, 0], 4.0), ([5, 0, 0], 1.0)]),
-        (True, [[100.0, 0.0], [0.0, 0.0]], []),
-        (True, [[100.0, 0.0], [1.5, 0.0]], [([208, 0, 0], 16.0), ([4, 0, 0], 4.0), ([5, 0, 0], 1.0)]),
+        (ControlConfig(), [[100.0, 0.0], [0.0, 0.0]], [([4, 0, 0], 4.0), ([5, 0, 0], 1.0)]),
+        (PAPER, [[100.0, 0.0], [0.0, 0.0]], []),
+        (PAPER, [[100.0, 0.0], [1.5, 0.0]], [([208, 0, 0], 16.0), ([4, 0, 0], 4.0), ([5, 0, 0], 1.0)]),
     ],
 )
-def test_finer_grids_wait_for_a_coarser_one_that_has_grown(waits, gradients, expected):
-    model = made_model([[0, 0, 0], [400, 0, 0]], [[0.0] * 3] * 2, replace(CERTAIN, finer_needs_coarser=waits))
+def test_finer_grids_wait_for_a_coarser_one_that_has_grown(preset, gradients, expected):
+    """As published; in the default preset they do not."""
+    config = replace(CERTAIN, finer_needs_coarser=preset.finer_needs_coarser)
+    model = made_model([[0, 0, 0], [400, 0, 0]], [[0.0] * 3] * 2, config)
     act(with_gradients(model, gradients), model, torch.tensor([NEAR, FAR]) * VOXEL)
     assert [(voxel, size) for voxel, _, size in grown_rows(model, 2)] == expected
 

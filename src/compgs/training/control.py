@@ -6,7 +6,7 @@ anchors on three grids of 16, 4 and 1 voxels; anchors whose primitives are trans
 The schedule is fractions of the run, so that short and long runs go through the same phases. The authors' release
 counts passes over the V training views instead: statistics from 3 V steps on, control from 5 V, every 2 V, until half
 of 30 000 steps. So passes can be given, too (`start_passes`, `every_passes`, `observe_passes`), and what comes first
-holds. With the `paper` preset 30 000 steps over 100 views and more go as published. A run too short for that keeps the
+holds. With the `paper` preset 30 000 steps over 103 views or more go as published. A run too short for that keeps the
 fractions: seven controls, or as many as there is a whole pass for before each.
 
 In few steps a primitive cannot be seen often. The published minimum of more than 40 sightings between two controls,
