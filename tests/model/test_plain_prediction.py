@@ -1,0 +1,169 @@
+"""The prediction against a program that was written from docs/bitstream_prediction.md alone."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from compgs.codec.content import Dimensions
+from compgs.codec.decoder import decode
+from compgs.codec.reader import read_latents
+from compgs.codec.writer import write_content
+from compgs.gaussians import Gaussians
+from compgs.model import HybridModel, PredictionHeads, Primitives, predict
+from compgs.model.prediction import OPACITY_CUTOFF
+
+ROOT = Path(__file__).parents[2]
+sys.path += [str(ROOT / "tools"), str(ROOT / "benchmarks")]
+from made_content import make_content  # noqa: E402
+from made_heads import head_shapes, make_heads  # noqa: E402
+from make_golden_gaussians import plain_content  # noqa: E402
+from plain_prediction import (  # noqa: E402
+    CUTOFF,
+    Arrays,
+    Content,
+    Primitive,
+    drawn,
+    primitives,
+    stacked,
+    tolerances,
+)
+from prediction_precision import FIELDS, camera_at  # noqa: E402
+
+CENTER = (0.5, -1.25, 2.0)
+DIMENSIONS = {
+    "paired": Dimensions(4, 6, 3, 1, 2, "paired", 8),
+    "separate": Dimensions(4, 6, 3, 1, 2, "separate", 8),
+    "one slot": Dimensions(1, 1, 1, 1, 1, "paired", 1),
+    "wide": Dimensions(2, 40, 16, 2, 2, "separate", 96),
+}
+
+
+def made(name: str, *, own_residuals: bool, anchors: int = 60) -> Content:
+    """Made-up content; some anchors have no coupled primitive at all."""
+    d = DIMENSIONS[name]
+    content, latents = read_latents(write_content(make_content(anchors, 5, d, kept=0.4)))
+    heads = make_heads(np.random.default_rng(6), d, own_residuals=own_residuals)
+    assert not content.mask.any(1).all()
+    return plain_content(replace(content, heads=heads), latents)
+
+
+def model_of(content: Content) -> HybridModel:
+    """The same in the package's own terms; names and shapes of the tensors must be those of its heads."""
+    n, k = content.mask.shape
+    tensors = {name: torch.from_numpy(t).float() for name, t in content.heads.items()}
+    residuals = torch.from_numpy(content.residuals).float()
+    if "residuals" in tensors:
+        residuals = tensors.pop("residuals")[
+            torch.arange(k).repeat(n)[torch.from_numpy(content.mask).view(-1)]
+        ]
+    network = "appearance" if content.layout == "paired" else "opacity"
+    heads = PredictionHeads(
+        content.references.shape[1],
+        residuals.shape[1],
+        len(tensors[f"{network}.input_bias"]),
+        content.layout,
+    )
+    heads.load_state_dict(tensors)
+    primitives = Primitives(
+        positions=torch.from_numpy(content.coordinates * content.voxel_size).float(),
+        log_scales=torch.from_numpy(content.log_scales).float(),
+        references=torch.from_numpy(content.references).float(),
+        residuals=residuals,
+        anchor_index=torch.from_numpy(np.argwhere(content.mask)[:, 0]),
+        voxel_size=content.voxel_size,
+    )
+    return HybridModel(primitives, heads.requires_grad_(False), content.view_distance_scale, (0.0, 0.0, 0.0))
+
+
+def clear_of_the_threshold(everything: list[Primitive]) -> bool:
+    return all(abs(p.opacity - CUTOFF) > 1e-4 for p in everything)
+
+
+def assert_conforms(gaussians: Gaussians, truth: Arrays) -> None:
+    assert len(gaussians) == len(truth["mean"]) > 0
+    allowed = tolerances(truth)
+    for name, field in FIELDS.items():
+        found = getattr(gaussians, field).double().numpy()
+        assert found.shape == truth[name].shape
+        assert (np.abs(found - truth[name]) <= allowed[name]).all(), name
+
+
+@pytest.mark.parametrize("own_residuals", [True, False], ids=["own residuals", "shared residuals"])
+@pytest.mark.parametrize("name", DIMENSIONS)
+def test_a_model_predicts_what_the_document_says(name: str, own_residuals: bool) -> None:
+    content = made(name, own_residuals=own_residuals)
+    everything = list(primitives(content, CENTER))
+    assert clear_of_the_threshold(everything) and len(everything) == content.mask.sum()
+    seen = drawn(content, CENTER)
+    assert len(seen) > 0 and (len(seen) < len(everything) or name == "one slot")
+    truth = stacked(seen)
+    model = model_of(content)
+    assert_conforms(model.gaussians(camera_at(CENTER)), truth)
+    gaussians, index = model.drawn(camera_at(CENTER))
+    assert_conforms(gaussians, truth)
+    places = {(p.anchor, p.slot): i for i, p in enumerate(everything)}
+    assert index.tolist() == [places[p.anchor, p.slot] for p in seen]
+    trained = predict(model.heads, model.primitives, torch.tensor(CENTER), content.view_distance_scale)
+    assert_conforms(trained.gaussians, truth)
+
+
+@pytest.mark.parametrize("name", ["paired", "separate"])
+def test_a_decoded_file_predicts_what_the_document_says(tmp_path: Path, name: str) -> None:
+    d = DIMENSIONS[name]
+    made = replace(make_content(80, 7, d, kept=0.5), heads=make_heads(np.random.default_rng(8), d))
+    made = replace(made, reference_step=0.5, residual_step=0.25, voxel_size=0.375, view_distance_scale=7.0)
+    path = tmp_path / "made.cgs"
+    path.write_bytes(write_content(made))
+    content = plain_content(*read_latents(path.read_bytes()))
+    assert clear_of_the_threshold(list(primitives(content, CENTER)))
+    assert_conforms(decode(path).gaussians(camera_at(CENTER)), stacked(drawn(content, CENTER)))
+
+
+def test_an_anchor_at_the_cameras_centre_is_seen_from_no_direction() -> None:
+    content = made("paired", own_residuals=True)
+    first = int(np.argmax(content.mask.any(1)))
+    x, y, z = (content.coordinates[first] * content.voxel_size).tolist()
+    everything = list(primitives(content, (x, y, z)))
+    assert clear_of_the_threshold(everything) and all(np.isfinite(p.color).all() for p in everything)
+    assert_conforms(model_of(content).gaussians(camera_at((x, y, z))), stacked(drawn(content, (x, y, z))))
+
+
+def test_a_world_offset_moves_the_camera_and_nothing_else() -> None:
+    content = made("paired", own_residuals=True)
+    offset = (4.2e6, 5.1e5, -3e3)
+    far = replace(content, world_offset=offset)
+    x, y, z = (a + b for a, b in zip(CENTER, offset, strict=True))
+    near, moved = stacked(drawn(content, CENTER)), stacked(drawn(far, (x, y, z)))
+    for name in FIELDS:
+        np.testing.assert_allclose(moved[name], near[name], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+def test_made_up_heads_have_the_tensors_of_the_package(layout: str) -> None:
+    d = Dimensions(3, 5, 4, 1, 1, layout, 7)
+    expected = {name: tuple(p.shape) for name, p in PredictionHeads(5, 4, 7, layout).named_parameters()}
+    heads = make_heads(np.random.default_rng(1), d)
+    assert {name: tensor.values.shape for name, tensor in heads} == head_shapes(d) == expected
+    shared = head_shapes(d, own_residuals=False)
+    assert shared == expected | {"residuals": (3, 4)}
+
+
+def test_the_documents_threshold_is_the_packages() -> None:
+    assert CUTOFF == OPACITY_CUTOFF
+
+
+def test_what_is_not_finite_or_has_no_rotation_is_not_drawn() -> None:
+    content = made("one slot", own_residuals=True)
+    seen = len(drawn(content, CENTER))
+    endless = replace(content, log_scales=content.log_scales + 1e4)
+    with np.errstate(over="ignore", invalid="ignore"):
+        assert drawn(endless, CENTER) == []
+    heads = dict(content.heads)
+    for name in ("output_weight", "skip_weight"):
+        heads[f"geometry.{name}"] = heads[f"geometry.{name}"] * 0
+    heads["geometry.output_bias"] = np.array([0.0] * 6 + [-1.0, 0.0, 0.0, 0.0])
+    assert seen > 0 and drawn(replace(content, heads=heads), CENTER) == []
