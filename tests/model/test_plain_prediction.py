@@ -123,8 +123,9 @@ def test_a_decoded_file_predicts_what_the_document_says(tmp_path: Path, name: st
     assert_conforms(decode(path).gaussians(camera_at(CENTER)), stacked(drawn(content, CENTER)))
 
 
-def test_an_anchor_at_the_cameras_centre_is_seen_from_no_direction() -> None:
-    content = made("paired", own_residuals=True)
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+def test_an_anchor_at_the_cameras_centre_is_seen_from_no_direction(layout: str) -> None:
+    content = made(layout, own_residuals=True)
     first = int(np.argmax(content.mask.any(1)))
     x, y, z = (content.coordinates[first] * content.voxel_size).tolist()
     everything = list(primitives(content, (x, y, z)))
