@@ -122,3 +122,14 @@ def level_counts(coordinates: NDArray[np.int32]) -> NDArray[np.int64]:
     origin, codes, _ = sorted_morton(coordinates)
     depth = octree_depth(coordinates.astype(np.int64) - origin)
     return np.cumsum(np.bincount(morton_levels(codes, depth), minlength=depth + 1))
+
+
+def represented(coordinates: NDArray[np.int32], level: int) -> NDArray[np.int64]:
+    """[n]: of the anchors in the prefix of an octree level, how many anchors their nodes of that level hold.
+
+    coordinates: [N, 3] of all anchors, in canonical order.
+    """
+    offsets = coordinates.astype(np.int64) - octree_origin(coordinates)
+    nodes = morton_codes(offsets) >> 3 * (octree_depth(offsets) - level)
+    _, first, counts = np.unique(nodes, return_index=True, return_counts=True)
+    return counts[np.argsort(first)]

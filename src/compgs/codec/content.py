@@ -128,6 +128,7 @@ class FileContent:
     groups: tuple[Group, ...]
     heads: tuple[tuple[str, QuantizedTensor], ...]  # prediction networks' parameters by name
     viewpoints: Viewpoints | None = None  # where to look from
+    stands_for: np.ndarray | None = None  # of a prefix: [N] anchors of the whole scene for which each stands
     metadata: dict[str, str] = field(default_factory=dict)  # for people; no decoder depends on it
 
     @property

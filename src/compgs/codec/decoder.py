@@ -16,6 +16,10 @@ from compgs.model.hybrid_model import HybridModel
 from compgs.model.prediction import SHARED_RESIDUALS, PredictionHeads
 from compgs.model.primitives import Primitives
 
+# Primitives of an anchor that stands for m anchors, of which only it has arrived, are m to this power as large: their
+# volume is that of all. 3 to 4 dB on a capture; other powers and wider offsets gave less.
+COARSE_GROWTH = 1 / 3
+
 
 def decode(
     path: str | Path, device: str | torch.device | None = None, *, prefix: int | None = None
@@ -64,11 +68,14 @@ def from_latents(content: FileContent, latents: Latents, device: torch.device) -
         residuals = values[SHARED_RESIDUALS][torch.from_numpy(slots)]
     else:
         residuals = _floats(d, latents, Role.RESIDUAL)
+    log_scales = _floats(d, latents, Role.LOG_SCALES)
+    if content.stands_for is not None:
+        log_scales[:, 3:] += COARSE_GROWTH * torch.from_numpy(np.log(content.stands_for)).float()[:, None]
     primitives = Primitives(
         positions=torch.from_numpy(
             content.coordinates.astype(np.float32) * np.float32(content.voxel_size)
         ).to(device),
-        log_scales=_floats(d, latents, Role.LOG_SCALES).to(device),
+        log_scales=log_scales.to(device),
         references=_floats(d, latents, Role.REFERENCE).to(device),
         residuals=residuals.to(device),
         anchor_index=torch.from_numpy(anchor_index).to(device),

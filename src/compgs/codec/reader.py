@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from compgs.codec.anchor_order import level_counts
+from compgs.codec.anchor_order import level_counts, represented
 from compgs.codec.content import (
     Dimensions,
     FileContent,
@@ -164,6 +164,8 @@ def read_latents(
         )
     _check_ranges(heads_of_ranges, level_counts(coordinates), mask, whole=not prefix)
     places = coordinate_context(coordinates)[:anchors]
+    whole = anchors == scene.anchors
+    stands_for = None if whole else represented(coordinates, heads_of_ranges[-1].level)
     coordinates, mask = coordinates[:anchors], mask[:anchors]
     all_symbols, latents = _decode_ranges(ranges, heads_of_ranges, d, priors, mask, places, keep_symbols)
     content = FileContent(
@@ -180,6 +182,7 @@ def read_latents(
         groups=tuple(map(Group, d.groups, priors, all_symbols)),
         heads=heads,
         viewpoints=viewpoints,
+        stands_for=stands_for,
         metadata=metadata,
     )
     return content, latents
