@@ -36,9 +36,16 @@ def figure(name: str, scene: str, rows: Sequence[Row]) -> bytes:
         axes.set_ylabel("PSNR of held-out views, dB")
         axes.grid(alpha=0.3)
     canvas.suptitle(f"{name}: {scene}", fontsize=11)
+    return png(canvas)
+
+
+def png(canvas: Any, dpi: int = 120) -> bytes:
+    """A finished figure, which is closed."""
+    from matplotlib import pyplot
+
     canvas.tight_layout()
     buffer = io.BytesIO()
-    canvas.savefig(buffer, format="png", dpi=120)
+    canvas.savefig(buffer, format="png", dpi=dpi)
     pyplot.close(canvas)
     return buffer.getvalue()
 
