@@ -11,6 +11,7 @@ and .png to --output.
 """
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -122,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except SplatFileError as reason:
         raise SystemExit(str(reason)) from reason
     given = sys.argv[1:] if arguments is None else arguments
-    text = report(name, measured, f"python benchmarks/similarity.py {' '.join(given)}", options.note)
+    text = report(name, measured, f"python benchmarks/similarity.py {shlex.join(given)}", options.note)
     stem = options.output / f"similarity_{name}"
     write_bytes(stem.with_name(stem.name + ".md"), text.encode())
     write_json(stem.with_name(stem.name + ".json"), {**measured.to_dict(), "commit": git_commit()})
