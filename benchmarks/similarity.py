@@ -91,7 +91,7 @@ def table(rows: Sequence[Similarity]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for row in rows:
-        cosines = ["none" if c is None else f"{c:.2f}" for c in (row.neighbours, row.random)]
+        cosines = ["none" if c is None else f"{round(c, 2) + 0.0:.2f}" for c in (row.neighbours, row.random)]
         left = ["" if share is None else f"{100 * share:.0f} %" for share in (row.left, row.left_random)]
         lines.append("| " + " | ".join([row.attribute, str(row.numbers), *cosines, *left]) + " |")
     return "\n".join(lines)
