@@ -177,9 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     text = report(points, results, command, f"{name}.png")
     write_bytes(options.output.with_name(f"{name}.md"), text.encode())
     facts = {key: results[key] for key in SAME}
-    write_json(
-        options.output.with_name(f"{name}.json"), {**facts, "points": [asdict(p) for p in points]}
-    )
+    write_json(options.output.with_name(f"{name}.json"), {**facts, "points": [asdict(p) for p in points]})
     write_bytes(options.output.with_name(f"{name}.png"), figure(points, results))
     print(text)
 

@@ -15,13 +15,28 @@ from quality_over_bytes_figure import plain_bytes, styles
 
 def record(variant: str, curve: str, size: int, psnr: float = 28.0, seed: int = 0, **more: Any) -> dict:
     results = {
-        "schema": "compgs results 1", "scene": "fox", "file": f"{variant}{seed}",
-        "views": 7, "width": 178, "height": 317, "psnr": psnr, "ssim": 0.9, "bytes": size, "splats": None, "sha256": f"{variant} {seed} {size}", **more,
-    }  # fmt: skip
+        "schema": "compgs results 1",
+        "scene": "fox",
+        "file": f"{variant}{seed}",
+        "views": 7,
+        "width": 178,
+        "height": 317,
+        "psnr": psnr,
+        "ssim": 0.9,
+        "bytes": size,
+        "splats": None,
+        "sha256": f"{variant} {seed} {size}",
+        **more,
+    }
     return {
-        "variant": variant, "label": f"{variant}!", "curve": curve, "seed": seed, "commit": "abc",
-        "training": {"steps": 1500}, "results": results,
-    }  # fmt: skip
+        "variant": variant,
+        "label": f"{variant}!",
+        "curve": curve,
+        "seed": seed,
+        "commit": "abc",
+        "training": {"steps": 1500},
+        "results": results,
+    }
 
 
 CURVES = [
@@ -63,7 +78,9 @@ def test_only_curves_and_plain_3dgs_are_drawn_each_file_once() -> None:
     assert drawn([*CURVES, hybrid, PLAIN, CURVES[0]]) == [*CURVES, PLAIN]
 
 
-@pytest.mark.parametrize(("key", "value"), [("scene", "plush"), ("views", 8), ("width", 356), ("height", 634)])
+@pytest.mark.parametrize(
+    ("key", "value"), [("scene", "plush"), ("views", 8), ("width", 356), ("height", 634)]
+)
 def test_results_of_other_views_are_refused(key: str, value: object) -> None:
     check_comparable([*CURVES, PLAIN])
     with pytest.raises(SystemExit, match=f"other0: expected .*{key}.* as of paper_0.10, found .*{value}"):
