@@ -1,0 +1,39 @@
+"""Commands on models that lie far from the world's origin."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import compgs.codec
+from compgs.cli.decode import Decode
+from compgs.cli.render import Render
+
+
+def test_the_circle_is_given_in_the_world_and_looks_at_the_model() -> None:
+    generator = torch.Generator().manual_seed(0)
+    positions = torch.randn(200, 3, generator=generator)
+    command = Render(file=Path("a.cgs"), output=Path("out"), frames=4)
+    near = command.circle(SimpleNamespace(bounds=(positions, None), world_offset=(0.0, 0.0, 0.0)))
+    offset = (4.2e6, -5.1e5, 3e3)
+    far = command.circle(SimpleNamespace(bounds=(positions, None), world_offset=offset))
+    assert [name for name, _ in far] == [name for name, _ in near]
+    for (_, a), (_, b) in zip(near, far, strict=True):
+        np.testing.assert_allclose(b.center - offset, a.center, rtol=0, atol=1e-7)
+        np.testing.assert_array_equal(a.rotation, b.rotation)
+
+
+def test_decoded_arrays_say_where_they_count_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = Path(__file__).parents[1] / "golden" / "default.cgs"
+    offset = (4.2e6, -5.1e5, 3e3)
+    model = replace(compgs.codec.decode(file), world_offset=offset)
+    monkeypatch.setattr(compgs.codec, "decode", lambda path, device=None: model)
+    Decode(file=file, output=tmp_path / "arrays").run()
+    for name, positions in (("latents.npz", "positions"), ("geometry.npz", "means")):
+        with np.load(tmp_path / "arrays" / name) as arrays:
+            assert arrays["world_offset"].tolist() == list(offset)
+            assert arrays["world_offset"].dtype == np.float64
+            assert np.abs(arrays[positions]).max() < 1e5
