@@ -1,6 +1,5 @@
 """Commands on models that lie far from the world's origin."""
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +10,8 @@ import torch
 import compgs.codec
 from compgs.cli.decode import Decode
 from compgs.cli.render import Render
+from compgs.config import Config, ModelConfig
+from compgs.trained_model import TrainedModel
 
 
 def test_the_circle_is_given_in_the_world_and_looks_at_the_model() -> None:
@@ -29,7 +30,9 @@ def test_the_circle_is_given_in_the_world_and_looks_at_the_model() -> None:
 def test_decoded_arrays_say_where_they_count_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = Path(__file__).parents[1] / "golden" / "default.cgs"
     offset = (4.2e6, -5.1e5, 3e3)
-    model = replace(compgs.codec.decode(file), world_offset=offset)
+    config = Config(model=ModelConfig(coupled_primitives=4, reference_dim=8, residuals=True, width=16))
+    coordinates = torch.arange(15).view(5, 3)
+    model = TrainedModel(config, coordinates, 0.05, 3.0, (0.0, 0.0, 0.0), offset).as_hybrid_model()
     monkeypatch.setattr(compgs.codec, "decode", lambda path, device=None: model)
     Decode(file=file, output=tmp_path / "arrays").run()
     for name, positions in (("latents.npz", "positions"), ("geometry.npz", "means")):

@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 
 from compgs.cameras import Camera
+from compgs.rotations import rotation_from_quaternion
 from compgs.scene import Points, Scene, View, load_scene
 from compgs.scene.colmap import read_sparse_model
 from compgs.scene.colmap_writer import write_sparse_model
 from compgs.scene.points import fallback_points, median_spacing
-from compgs.scene.rotations import rotation_from_quaternion
 from compgs.scene.world import FAR, local_scene, world_offset
 
 Write = Callable[..., Path]

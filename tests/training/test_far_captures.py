@@ -12,11 +12,11 @@ from compgs.config import Config
 from compgs.errors import NotEncodable
 from compgs.evaluation.importance import importance
 from compgs.render import render
+from compgs.rotations import rotation_from_quaternion
 from compgs.scene import Points, Scene, load_scene
 from compgs.scene.colmap import read_sparse_model
 from compgs.scene.colmap_writer import write_sparse_model
 from compgs.scene.generated import generate_scene
-from compgs.scene.rotations import rotation_from_quaternion
 from compgs.training import train, train_splats
 from compgs.training.checkpoint import load_checkpoint
 from compgs.training.loop import CHECKPOINT_NAME

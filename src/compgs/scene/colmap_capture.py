@@ -6,9 +6,9 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
+from compgs.rotations import rigid, rotation_from_quaternion
 from compgs.scene.capture import Capture, PosedImage, check_camera, usable_positions
 from compgs.scene.colmap import UNDISTORT_COMMAND, ColmapCamera, ColmapImage, read_sparse_model
-from compgs.scene.rotations import rigid, rotation_from_quaternion
 from compgs.scene.undistort import MODELS, Distortion
 from compgs.scene.views import Points
 
