@@ -83,7 +83,7 @@ def test_what_is_decoded_is_near_to_what_was_encoded(viewpoints: Viewpoints) -> 
     found = decode_viewpoints(data, "viewpoints")
     positions = np.array([view.center for view in viewpoints.views])
     (radius,) = struct.unpack_from("<f", data, 15)
-    if len(positions) > 1 and np.ptp(positions, axis=0).max() > 1e-5 * np.abs(positions).max():
+    if len(positions) > 1 and np.ptp(positions, axis=0).max() > max(1e-30, 1e-5 * np.abs(positions).max()):
         assert radius == pytest.approx(np.ptp(positions, axis=0).max() / 2, rel=0.2)  # no larger than needed
     assert len(found.views) == len(viewpoints.views)
     assert math.hypot(*found.up) == pytest.approx(1)
@@ -120,6 +120,13 @@ def test_one_camera_or_several_in_one_place_are_exactly_there_in_single_precisio
     views = tuple(Viewpoint((1.0, 0, 0, 0), (0.5, -3.0, 8.25), *LENS) for _ in range(3))
     found = decode_viewpoints(encode_viewpoints(Viewpoints((0, -1, 0), views)), "viewpoints")
     assert all(view.center == (0.5, -3.0, 8.25) for view in found.views)
+
+
+@pytest.mark.parametrize("apart", [4e-45, 1e-40, 1e-30])
+def test_cameras_hardly_apart_are_where_they_were(apart: float) -> None:
+    views = tuple(Viewpoint((1.0, 0, 0, 0), (x, 0.0, 0.0), *LENS) for x in (0.0, apart))
+    found = decode_viewpoints(encode_viewpoints(Viewpoints((0, -1, 0), views)), "viewpoints")
+    assert abs(found.views[1].center[0] - apart) < 1e-34
 
 
 def changed(offset: int, layout: str, *values: float) -> bytes:

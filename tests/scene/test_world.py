@@ -115,6 +115,7 @@ def test_captures_have_an_offset_from_a_hundred_extents_on(extent: float) -> Non
 
 def test_the_offset_is_the_training_cameras_mean_in_whole_units() -> None:
     assert world_offset(scene_at(np.array([4.2e6 + 0.4, -5.1e5 - 0.7, -0.3]), 5.0)) == (4.2e6, -510001.0, 0.0)
+    assert world_offset(scene_at(np.array([4200123.4, 0, 0]), 5000.0)) == (4200123.0, 0.0, 0.0)
     assert not np.signbit(world_offset(scene_at(np.array([1e6, 0, -0.3]), 5.0))[2])
 
 

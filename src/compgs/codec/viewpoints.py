@@ -163,12 +163,11 @@ def _box(views: tuple[Viewpoint, ...]) -> tuple[np.ndarray, float]:
     positions = np.array([view.center for view in views], dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         center = ((positions.min(axis=0) + positions.max(axis=0)) / 2).astype(np.float32).astype(np.float64)
-        reach = float(np.abs(positions - center).max())  # from the rounded middle
-        single = np.float32(reach)
-        radius = float(single if single >= reach else np.nextafter(single, np.float32(np.inf)))
+        radius = float(np.float32(np.abs(positions - center).max()))  # from the rounded middle
     if not (np.isfinite(center).all() and radius < math.inf):
         raise NotEncodable("viewpoints: a camera's position is not finite in single precision")
-    return center, radius if radius > 0 else 1.0  # all in one place: any radius does
+    # All in one place: any radius does; one that single precision holds only roughly would not.
+    return center, radius if radius >= np.finfo(np.float32).tiny else 1.0
 
 
 def _packed_rotation(rotation: Quaternion) -> int:
