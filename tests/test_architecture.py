@@ -13,7 +13,9 @@ import compgs
 SOURCE = Path(compgs.__file__).parent
 
 # A part may import itself, and the parts named here.
-BASE = {"compgs", "linear", "vector_sums", "errors", "gaussians", "cameras", "config", "outputs", "presets"}
+BASE = {
+    "compgs", "linear", "vector_sums", "rotations", "errors", "gaussians", "cameras", "config", "outputs", "presets",
+}  # fmt: skip
 ALLOWED = {
     "compgs": {
         "errors",
@@ -33,6 +35,7 @@ ALLOWED = {
     "config": {"errors", "presets"},
     "presets": set(),
     "vector_sums": set(),
+    "rotations": set(),
     "linear": set(),
     "scene": BASE,
     "render": BASE,
@@ -122,7 +125,18 @@ def test_decoding_never_loads_scenes_losses_or_training() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["rans", "tables", "integer_network", "octree", "mask_coder", "weights", "reader"]
+    "module",
+    [
+        "rans",
+        "tables",
+        "integer_network",
+        "octree",
+        "mask_coder",
+        "weights",
+        "reader",
+        "viewpoints",
+        "viewpoint_cameras",
+    ],
 )
 def test_from_bytes_to_symbols_no_torch_is_loaded(module: str) -> None:
     loaded = modules_after(f"import compgs.codec.{module}")

@@ -1,5 +1,6 @@
 """Camera: where a view was taken from, in the OpenCV convention (x right, y down, z forward)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +32,18 @@ class Camera:
     def center(self) -> np.ndarray:
         """[3] position of the camera in world units."""
         return -self.rotation.T @ self.translation
+
+    def moved(self, origin: Sequence[float] | np.ndarray) -> "Camera":
+        """The same camera in a frame whose origin lies at `origin` [3] of this one, its axes parallel (float64).
+
+        The camera itself where `origin` is zero, so that nothing that is kept for a camera is computed again.
+        """
+        if not np.any(origin):
+            return self
+        pose = np.array(self.world_to_camera, dtype=np.float64)
+        # x_camera = R (x - origin) + (t + R origin): right also where R is a rotation only nearly.
+        pose[:3, 3] += pose[:3, :3] @ np.asarray(origin, dtype=np.float64)
+        return replace(self, world_to_camera=pose)
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same view, sampled on another grid of pixels; the field of view is unchanged."""

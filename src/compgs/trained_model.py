@@ -26,6 +26,9 @@ SHARED_RESIDUAL_BITS = 10
 class TrainedModel(nn.Module):
     """N anchors on a voxel grid with K coupled primitives each.
 
+    An anchor is at coordinates * voxel_size + world_offset in the world. Everything here and in training lives in the
+    local frame, without the offset: single precision holds it also far from the world's origin.
+
     Embeddings are kept in units of their quantization step, so that a learning rate is a number of steps; log scales
     in natural units relative to the voxel size.
     """
@@ -40,6 +43,7 @@ class TrainedModel(nn.Module):
         voxel_size: float,  # world units
         distance_unit: float,  # world units, of the view embedding
         background: tuple[float, float, float],
+        world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),  # world units, float64
     ) -> None:
         super().__init__()
         m = config.model
@@ -48,6 +52,7 @@ class TrainedModel(nn.Module):
         self.voxel_size = voxel_size
         self.distance_unit = distance_unit
         self.background = background
+        self.world_offset = world_offset
         self.heads = PredictionHeads(m.reference_dim, m.residual_dim, m.width, m.heads)
         self.entropy = EntropyModel(m, config.entropy)
         self.register_buffer("coordinates", coordinates.to(torch.int32))
@@ -71,7 +76,7 @@ class TrainedModel(nn.Module):
         return self.log_scales.device
 
     def positions(self, rows: Tensor | None = None) -> Tensor:
-        """[N, 3] float32 world units, of the given anchors or all."""
+        """[N, 3] float32 world units in the local frame, of the given anchors or all."""
         coordinates = self.coordinates if rows is None else self.coordinates[rows]
         return coordinates.to(torch.float32) * self.voxel_size
 
@@ -169,7 +174,13 @@ class TrainedModel(nn.Module):
             primitives.anchor_index[kept],
             primitives.voxel_size,
         )
-        return HybridModel(chosen, heads.requires_grad_(False), self.distance_unit, self.background)
+        return HybridModel(
+            chosen,
+            heads.requires_grad_(False),
+            self.distance_unit,
+            self.background,
+            world_offset=self.world_offset,
+        )
 
     @torch.no_grad()
     def estimated_bits(self) -> dict[str, float]:

@@ -170,3 +170,13 @@ def test_real_splats_of_another_program_are_read() -> None:
     assert splats.degree == 2
     assert 0.3 < splats.opacity_logits.sigmoid().mean() <= 1
     assert splats.log_scales.exp().median() < (splats.means.amax(0) - splats.means.amin(0)).max()
+
+
+def test_positions_in_the_file_are_world_coordinates(tmp_path: Path) -> None:
+    splats, offset = made(7), (4.2e6, -5.1e5, 3000.25)
+    write_ply(splats, tmp_path / "scene.ply", world_offset=offset)
+    again = read_ply(tmp_path / "scene.ply")
+    world = splats.means.double() + torch.tensor(offset, dtype=torch.float64)
+    assert torch.equal(again.means, world.float())
+    for name in ("log_scales", "quaternions", "opacity_logits", "dc", "rest"):
+        assert torch.equal(getattr(again, name), getattr(splats, name)), name

@@ -112,3 +112,22 @@ def test_settings_that_gsplat_cannot_obey_are_refused():
     ):
         with pytest.raises(ConfigError, match="on CUDA only background, dilation, near_plane"):
             check_settings(dataclasses.replace(RasterSettings(), **change))
+
+
+def test_cameras_of_the_world_are_moved_into_the_models_frame():
+    class Far(PlainModel):
+        world_offset = (4.2e6, 5.1e5, 3e3)
+        asked: list[Camera] = []  # noqa: RUF012
+
+        def gaussians(self, camera: Camera) -> Gaussians:
+            self.asked.append(camera)
+            return make_gaussians(50)
+
+    camera = CAMERA.moved(-np.array(Far.world_offset))
+    image, again = render(Far(), camera).image, render(Far(), camera).image
+    assert torch.allclose(image, render(PlainModel(), CAMERA).image, atol=1e-5)
+    assert torch.equal(image, again)
+    np.testing.assert_allclose(Far.asked[0].center, CAMERA.center, atol=1e-8)
+    assert Far.asked[0] is Far.asked[1]  # so that what is kept for a camera is found again
+    plain = render(PlainModel(), camera).image
+    assert not torch.allclose(plain, image, atol=0.1)  # it was the offset that brought it back

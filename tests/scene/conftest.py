@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from compgs.rotations import quaternion_from_rotation
 from compgs.scene.colmap import ColmapCamera, ColmapImage, ColmapPoints
 from compgs.scene.colmap_writer import write_sparse_model
-from compgs.scene.rotations import quaternion_from_rotation
 
 PINHOLE = ColmapCamera(1, "PINHOLE", 24, 16, (20.0, 21.0, 12.5, 8.25))
 

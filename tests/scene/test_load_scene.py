@@ -11,10 +11,10 @@ from PIL import Image
 
 from compgs.cameras import Camera
 from compgs.errors import ConfigError
+from compgs.rotations import rotation_from_quaternion
 from compgs.scene import View, load_scene
 from compgs.scene.colmap import ColmapCamera, read_sparse_model
 from compgs.scene.colmap_writer import write_sparse_model
-from compgs.scene.rotations import rotation_from_quaternion
 
 Write = Callable[..., Path]
 PINHOLE = ColmapCamera(1, "PINHOLE", 24, 16, (20.0, 21.0, 12.5, 8.25))

@@ -20,7 +20,9 @@ class Decode(ComputingCommand, FileArgument):
 
     latents.npz: positions [N, 3], log_scales [N, 6] and references [N, C] of the anchors; residuals [P, C]
     and anchor_index [P] of the coupled primitives. geometry.npz: their means, scales [P, 3] and quaternions
-    [P, 4] (w-x-y-z) in world units. Opacity and color depend on the view: `compgs render` shows them.
+    [P, 4] (w-x-y-z) in world units. Positions and means count from the file's world_offset [3], which both
+    files repeat in float64 and which is mostly zero: add it for world coordinates. Opacity and color depend
+    on the view: `compgs render` shows them.
 
     Examples
 
@@ -54,7 +56,9 @@ class Decode(ComputingCommand, FileArgument):
         if self.output is None:
             return
         import numpy as np
+        import torch
 
+        offset = torch.tensor(model.world_offset, dtype=torch.float64)
         p = model.primitives
         means, scales, quaternions = model.geometry
         contents = {
@@ -64,8 +68,14 @@ class Decode(ComputingCommand, FileArgument):
                 "references": p.references,
                 "residuals": p.residuals,
                 "anchor_index": p.anchor_index,
+                "world_offset": offset,
             },
-            "geometry.npz": {"means": means, "scales": scales, "quaternions": quaternions},
+            "geometry.npz": {
+                "means": means,
+                "scales": scales,
+                "quaternions": quaternions,
+                "world_offset": offset,
+            },
         }
         for name, tensors in contents.items():
             buffer = io.BytesIO()

@@ -128,9 +128,11 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
         return [(view.name, view.camera) for view in chosen]
 
     def circle(self, model: "SceneModel") -> "Sequence[tuple[str, Camera]]":
+        import numpy as np
+
         from compgs.evaluation.camera_path import orbit
 
-        return orbit(
+        circle = orbit(
             model.bounds[0].cpu().numpy(),
             frames=self.frames,
             width=self.width,
@@ -139,6 +141,8 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
             elevation=self.elevation,
             distance=self.distance,
         )
+        # Around the model's own frame; cameras are given in the world's.
+        return [(name, camera.moved(-np.array(model.world_offset))) for name, camera in circle]
 
     def render(self, model: "SceneModel", views: "Sequence[tuple[str, Camera]]") -> None:
         from compgs.evaluation.camera_path import camera_entry

@@ -70,6 +70,10 @@ def to_content(model: TrainedModel) -> FileContent:
     for name, parameter in model.named_parameters():
         if not torch.isfinite(parameter).all():
             raise NotEncodable(f"{name} holds values that are not finite: the training has diverged")
+    if any(model.world_offset):
+        raise NotEncodable(
+            f"the model counts positions from {model.world_offset}, which this version of the file cannot hold"
+        )
     kept = model.mask.any(1).cpu()
     if not kept.any():
         raise NotEncodable("no coupled primitive exists: there is nothing to encode")

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.model.hybrid_model import HybridModel
-from compgs.render import RasterSettings, contributions, visible_mask
+from compgs.render import RasterSettings, contributions, local_camera, visible_mask
 
 
 def importance(
@@ -19,7 +19,8 @@ def importance(
     """
     settings = RasterSettings(background=model.background)
     total = torch.zeros(model.coupled, dtype=torch.float64, device=model.primitives.positions.device)
-    for i, camera in enumerate(cameras):
+    for i, world_camera in enumerate(cameras):
+        camera = local_camera(model, world_camera)
         gaussians, drawn = model.drawn(camera, visible_mask(*model.bounds, camera, settings))
         # No atomics: `drawn` names each primitive once, so the sum is the same in every run.
         total[drawn] += contributions(gaussians, camera, settings).double()

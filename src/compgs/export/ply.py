@@ -2,7 +2,7 @@
 
 | properties | what |
 |---|---|
-| x y z | mean, world units |
+| x y z | mean, world coordinates in single precision: what other programs expect |
 | nx ny nz | normals, zero: nothing uses them, some programs expect them |
 | f_dc_0 ... 2 | harmonic coefficients of degree 0: red, green, blue |
 | f_rest_0 ... | of degrees 1 to 3, channel by channel: all of red (3, 8 or 15), all of green, all of blue |
@@ -15,7 +15,7 @@ vertices); what it needs must be there, in single or double precision, finite, a
 """
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -75,16 +75,29 @@ class PlyHeader:
 # writing -----------------------------------------------------------------------------------------------------------
 
 
-def write_ply(splats: Splats, path: str | Path, *, overwrite: bool = False) -> int:
-    """Write splats, whole or not at all; the number of bytes. Raises OutputError."""
-    data = ply_bytes(splats)
+def write_ply(
+    splats: Splats,
+    path: str | Path,
+    *,
+    world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),  # world units: origin of the splats' frame
+    overwrite: bool = False,
+) -> int:
+    """Write splats, whole or not at all; the number of bytes. Raises OutputError.
+
+    Positions in the file are world coordinates, `means + world_offset`, as float32, for that is what other programs
+    expect: of a scene 4 000 km from its origin they are whole multiples of 0.25 to 0.5 m.
+    """
+    data = ply_bytes(splats, world_offset)
     check_output_file(Path(path), overwrite=overwrite, needed_bytes=len(data))
     write_bytes(Path(path), data)
     return len(data)
 
 
-def ply_bytes(splats: Splats) -> bytes:
-    """The content of the file."""
+def ply_bytes(splats: Splats, world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bytes:
+    """The content of the file; see `write_ply`."""
+    if any(world_offset):
+        means = splats.means.detach().cpu().double()
+        splats = replace(splats, means=means + means.new_tensor(world_offset))
     names = [name for group in property_groups(splats.degree).values() for name in group]
     table = np.zeros((len(splats), len(names)), "<f4")
     for columns, tensor in _columns(splats):

@@ -35,6 +35,10 @@ GPU_BLOCK = 1 << 18  # a GPU is not busy with fewer
 class HybridModel:
     """Anchors, residuals and prediction networks of one scene; `gaussians(camera)` is what a view renders.
 
+    Everything here lives in the model's local frame: world coordinates minus `world_offset`, so that single precision
+    is enough far from the world's origin. Its methods take cameras of that frame; `compgs.render` takes those of
+    the world and moves them.
+
     Geometry of coupled primitives does not depend on the view and is predicted once, on first use; a view then costs
     opacity and color of the anchors that may be in it.
     """
@@ -46,6 +50,11 @@ class HybridModel:
     appearance_dtype: torch.dtype = (
         torch.float32
     )  # in which opacity and color are computed; bfloat16: for GPUs
+    world_offset: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # world units, float64: origin of the local frame
 
     @property
     def anchors(self) -> int:

@@ -69,10 +69,19 @@ def splat_radii(splats: Splats) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SplatModel:
-    """A scene of splats; `gaussians(camera)` is what a view renders. A .ply file does not know its background."""
+    """A scene of splats; `gaussians(camera)` is what a view renders. A .ply file does not know its background.
+
+    Splats and the cameras of `gaussians` are in the local frame, world coordinates minus `world_offset`;
+    `compgs.render` takes cameras of the world and moves them.
+    """
 
     splats: Splats
     background: tuple[float, float, float]  # RGB, 0 to 1
+    world_offset: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # world units, float64: origin of the local frame
 
     @functools.cached_property
     def bounds(self) -> tuple[Tensor, Tensor]:

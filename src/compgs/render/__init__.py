@@ -6,12 +6,20 @@ from typing import Any
 
 from compgs.render.contributions import contributions
 from compgs.render.rasterize import rasterize
-from compgs.render.render_model import render
+from compgs.render.render_model import local_camera, render
 from compgs.render.result import RasterResult
 from compgs.render.settings import RasterSettings
 from compgs.render.visibility import visible_mask
 
-__all__ = ["RasterResult", "RasterSettings", "contributions", "rasterize", "render", "visible_mask"]
+__all__ = [
+    "RasterResult",
+    "RasterSettings",
+    "contributions",
+    "local_camera",
+    "rasterize",
+    "render",
+    "visible_mask",
+]
 
 
 class _CallablePackage(ModuleType):

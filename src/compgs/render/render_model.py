@@ -1,6 +1,7 @@
 """The public face of rendering: a decoded or trained scene, seen from a camera."""
 
-from typing import Protocol
+import functools
+from typing import Any, Protocol
 
 import torch
 
@@ -17,6 +18,7 @@ class Renderable(Protocol):
 
     A model with `bounds` (centres [N, 3] and radii [N] of its anchors) is asked for the anchors in view only,
     as `gaussians(camera, visible)`; one that also has `parts` for what they have, at most `coupled`, a part at a time.
+    A model with a `world_offset` (3 numbers, world units) is asked in its local frame, world minus offset.
     """
 
     @property
@@ -25,9 +27,21 @@ class Renderable(Protocol):
     def gaussians(self, camera: Camera) -> Gaussians: ...
 
 
+def local_camera(model: Any, camera: Camera) -> Camera:
+    """A camera of the world in the model's own frame, moved in double precision: where the two meet."""
+    return _moved(camera, getattr(model, "world_offset", (0.0, 0.0, 0.0)))
+
+
+@functools.lru_cache(maxsize=4096)
+def _moved(camera: Camera, offset: tuple[float, float, float]) -> Camera:
+    """Kept: what others keep for a camera is then found again in the next frame."""
+    return camera.moved(offset)
+
+
 @torch.no_grad()
 def render(model: Renderable, camera: Camera, settings: RasterSettings | None = None) -> RasterResult:
-    """One view of a scene, without gradients. By default over the model's own background."""
+    """One view of a scene, without gradients, from a camera of the world. By default over the model's background."""
+    camera = local_camera(model, camera)
     settings = settings or RasterSettings(background=model.background)
     bounds = getattr(model, "bounds", None)
     if bounds is None:

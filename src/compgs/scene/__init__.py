@@ -159,7 +159,9 @@ def _different(positions: np.ndarray) -> int:  # positions: [P, 3]
 def _extent(views: list[View], points: Points) -> float:
     centers = np.stack([view.camera.center for view in views])
     extent = scene_extent(centers)
-    if extent > 1e-6 * float(np.abs(centers).max(initial=1e-30)):
+    distance = float(np.median(np.linalg.norm(points.positions - centers.mean(axis=0), axis=1)))
+    # Not beside the distance to the origin, which says nothing: a capture may be in geographic coordinates.
+    if extent > 1e-6 * distance:
         return extent
     # all views from one place: the distance of the points is the only length there is
-    return float(np.median(np.linalg.norm(points.positions - centers.mean(axis=0), axis=1)))
+    return distance

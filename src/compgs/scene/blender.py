@@ -21,7 +21,7 @@ def read_blender(folder: Path) -> Capture:
         raise SceneError(
             f"{folder / 'transforms_train.json'}: no frames; expected at least one training view"
         )
-    nothing = Points(np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.uint8))
+    nothing = Points(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
     names = frozenset(posed.name for posed in test) if test else None
     # white: what the scenes' published figures stand on
     return Capture(train + test, names, nothing, str(folder), (1.0, 1.0, 1.0))

@@ -10,7 +10,8 @@ from compgs.errors import UnsupportedCamera
 from compgs.scene.undistort import Distortion
 from compgs.scene.views import Points
 
-MAX_DISTANCE = 1e9  # world units from the origin: beyond it single precision leaves nothing of a scene
+MAX_DISTANCE = 1e9  # world units from the origin: the Earth's radius in centimetres is less
+MAX_COORDINATE = 1e30  # world units, of a point: beyond it distances overflow single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,11 @@ class Capture:
     points_source: str  # the file of the points, for messages
     background: tuple[float, float, float]  # what the layout's images stand on by default
     notes: tuple[str, ...] = ()
+
+
+def usable_positions(positions: np.ndarray) -> np.ndarray:  # positions: [P, 3] float64
+    """[P] bool: points that have a place, finite also in single precision."""
+    return (np.abs(positions) < MAX_COORDINATE).all(axis=1)  # False where not a number
 
 
 def check_camera(camera: Camera, place: str) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
-from compgs.scene.capture import Capture, PosedImage, check_camera
+from compgs.rotations import rigid, rotation_from_quaternion
+from compgs.scene.capture import Capture, PosedImage, check_camera, usable_positions
 from compgs.scene.colmap import UNDISTORT_COMMAND, ColmapCamera, ColmapImage, read_sparse_model
-from compgs.scene.rotations import rigid, rotation_from_quaternion
 from compgs.scene.undistort import MODELS, Distortion
 from compgs.scene.views import Points
 
@@ -29,10 +29,8 @@ def read_colmap(folder: Path, sparse: Path, images: Path) -> Capture:
         camera, lens = _pinhole_and_lens(model.cameras[image.camera_id], _pose(image, place), place)
         check_camera(camera, place)
         posed.append(PosedImage(image.name, images / image.name, camera, lens))
-    finite = np.isfinite(model.points.positions).all(axis=1) & (np.abs(model.points.positions) < 1e30).all(
-        axis=1
-    )
-    points = Points(model.points.positions[finite].astype(np.float32), model.points.colors[finite])
+    finite = usable_positions(model.points.positions)
+    points = Points(model.points.positions[finite], model.points.colors[finite])
     notes = (f"{(~finite).sum()} points without a finite position were left out",) if not finite.all() else ()
     return Capture(tuple(posed), None, points, str(sparse), (0.0, 0.0, 0.0), notes)
 

@@ -45,7 +45,7 @@ def _points(folder: Path, values: dict[str, Any]) -> Points:
     ply = values.get("ply_file_path")
     if isinstance(ply, str) and (folder / ply).is_file():
         return read_ply_points(folder / ply)
-    return Points(np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.uint8))
+    return Points(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
 
 
 def _posed_image(name: str, path: Path, values: dict[str, Any], place: str) -> PosedImage:

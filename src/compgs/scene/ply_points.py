@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from compgs.errors import SceneError
+from compgs.scene.capture import usable_positions
 from compgs.scene.views import Points
 
 _TYPES = {
@@ -40,7 +41,7 @@ def read_ply_points(file: Path) -> Points:
         else:
             vertices = np.frombuffer(body, np.dtype([(n, order + t) for n, t in columns]), count)
             rows = {name: vertices[name] for name, _ in columns}
-        positions = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float32)
+        positions = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
     except (ValueError, KeyError) as error:
         raise SceneError(
             f"{file}: vertices with x, y, z were expected ({error}); export them again"
@@ -49,7 +50,7 @@ def read_ply_points(file: Path) -> Points:
         colors = np.stack([rows[name] for name in ("red", "green", "blue")], axis=1).astype(np.uint8)
     else:
         colors = np.full((count, 3), _GRAY, dtype=np.uint8)
-    finite = np.isfinite(positions).all(axis=1)
+    finite = usable_positions(positions)
     return Points(positions[finite], colors[finite])
 
 

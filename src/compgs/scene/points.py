@@ -85,7 +85,7 @@ def fallback_points(cameras: Sequence[Camera], count: int, seed: int = 0) -> Poi
         u, v = pixels[mine, 0] * camera.width, pixels[mine, 1] * camera.height
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], axis=1)
         positions[mine] = (rays * depth[mine, None] - camera.translation) @ camera.rotation
-    return Points(positions.astype(np.float32), np.full((count, 3), 128, dtype=np.uint8))
+    return Points(positions, np.full((count, 3), 128, dtype=np.uint8))
 
 
 def _closest_to_axes(centers: np.ndarray, directions: np.ndarray) -> np.ndarray:

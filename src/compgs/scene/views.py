@@ -21,7 +21,7 @@ class View:
 class Points:
     """Sparse points of the scene, as structure from motion gives them."""
 
-    positions: np.ndarray  # [P, 3] float32, world units
+    positions: np.ndarray  # [P, 3] float64 as read, world units
     colors: np.ndarray  # [P, 3] uint8, display RGB
 
     def __len__(self) -> int:

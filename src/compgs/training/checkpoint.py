@@ -47,6 +47,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
                 "voxel_size": model.voxel_size,
                 "distance_unit": model.distance_unit,
                 "background": list(model.background),
+                "world_offset": list(model.world_offset),
             }
         ),
         "state": json.dumps(checkpoint.state),
@@ -85,6 +86,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         scene["voxel_size"],
         scene["distance_unit"],
         tuple(scene["background"]),
+        tuple(scene.get("world_offset", (0.0, 0.0, 0.0))),  # older checkpoints have none
     )
     channels = parts["model"]["references"].shape[1]
     keep_channels(model, torch.arange(model.reference_dim) < channels)

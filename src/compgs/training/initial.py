@@ -8,6 +8,7 @@ from compgs.config import Config
 from compgs.errors import ConfigError
 from compgs.scene.points import colors_at, median_spacing, voxel_grid
 from compgs.scene.views import Scene
+from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
 
 COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
@@ -17,9 +18,12 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
     """Anchors on the voxel grid of the scene's points (CompGS Sec. 3.4), as large as the distance to their neighbours.
 
     With `point_colors` they have the points' colors, too: from gray, hundreds of steps would go into finding them.
+    A scene far from the world's origin gets a `world_offset`, from which its anchors are counted.
     Raises ConfigError if the voxel size that was asked for gives more than `max_anchors`.
     """
     m = config.model
+    offset = world_offset(scene)
+    scene = local_scene(scene, offset)
     wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
     coordinates, voxel_size = voxel_grid(scene.points, wanted)
     if m.voxel_size and len(coordinates) > m.max_anchors:
@@ -32,7 +36,7 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.training.seed)
         model = TrainedModel(
-            config, torch.from_numpy(coordinates), voxel_size, scene.extent, scene.background
+            config, torch.from_numpy(coordinates), voxel_size, scene.extent, scene.background, offset
         )
     neighbours = min(4, len(coordinates))
     distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(len(coordinates), neighbours)

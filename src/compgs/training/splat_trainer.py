@@ -19,6 +19,7 @@ from compgs.losses import Target, photometric_loss
 from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
 from compgs.render import RasterSettings, rasterize, visible_mask
 from compgs.scene.views import Scene
+from compgs.scene.world import local_scene, world_offset
 from compgs.training.checkpoint import (
     check_same_run,
     optimizer_tensors,
@@ -78,7 +79,7 @@ def train_splats(
         trainer = SplatTrainer(scene, config, chosen)
     trainer.profile = profile or trainer.profile
     trainer.run(path, on_progress)
-    return SplatModel(trainer.parameters.trained(), scene.background)
+    return SplatModel(trainer.parameters.trained(), scene.background, trainer.world_offset)
 
 
 class SplatTrainer:
@@ -88,11 +89,17 @@ class SplatTrainer:
     lmbda = None  # nothing is weighed against the size
 
     def __init__(
-        self, scene: Scene, config: Config, device: torch.device, splats: Splats | None = None
+        self,
+        scene: Scene,
+        config: Config,
+        device: torch.device,
+        splats: Splats | None = None,
+        offset: tuple[float, float, float] | None = None,  # world units, of these splats; None: the scene's
     ) -> None:
         if not scene.train_views:
             raise ConfigError(f"{scene.name}: no training views are left after holding out the test views")
-        self.scene = scene
+        self.world_offset = world_offset(scene) if offset is None else offset
+        scene = self.scene = local_scene(scene, self.world_offset)
         self.config = config
         self.device = device
         self.parameters = SplatParameters((splats or initial_splats(scene.points, config.splats)).to(device))
@@ -203,6 +210,7 @@ class SplatTrainer:
             "order": self.order,
             "shuffle": self.shuffle.bit_generator.state,
             "views": [view.name for view in self.scene.train_views],
+            "world_offset": self.world_offset,
         }
         metadata = {"config": json.dumps(self.config.to_dict()), "state": json.dumps(state)}
         write_checkpoint_file(path, METHOD, tensors, metadata)
@@ -215,7 +223,8 @@ class SplatTrainer:
         saved = config_from_dict(json.loads(metadata["config"]), str(path))
         check_same_run(saved, config, state["views"], scene)
         parts = tensors_by_kind(tensors)
-        trainer = cls(scene, config, device, Splats(**parts["model"]))
+        offset = tuple(state.get("world_offset", (0.0, 0.0, 0.0)))  # older checkpoints have none
+        trainer = cls(scene, config, device, Splats(**parts["model"]), offset)
         restore_optimizer(trainer.parameters, trainer.optimizer, parts["optimizer"])
         for name in DensityControl.STATISTICS:
             setattr(trainer.control, name, parts["extra"][f"control/{name}"].to(device))

@@ -27,6 +27,7 @@ from compgs.losses import (
 from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
 from compgs.render import RasterSettings, contributions, rasterize, visible_mask
 from compgs.scene.views import Scene, View
+from compgs.scene.world import local_scene
 from compgs.trained_model import BIAS_BITS, TrainedModel
 from compgs.training.checkpoint import (
     Checkpoint,
@@ -101,10 +102,10 @@ class Trainer:
     ) -> None:
         if not scene.train_views:
             raise ConfigError(f"{scene.name}: no training views are left after holding out the test views")
-        self.scene = scene
         self.config = config
         self.device = device
         self.model = (model or initial_model(scene, config)).to(device)
+        self.scene = local_scene(scene, self.model.world_offset)
         self.optimizer = make_optimizer(self.model, config.training)
         self.schedule = make_schedule(config.control, config.training.steps, len(scene.train_views))
         self.pruned_at = {round(share * config.training.steps) for share in config.control.prune_at}
