@@ -14,6 +14,7 @@ from typing import Any, Literal
 from compgs.errors import ConfigError
 
 PRESETS = ("default", "paper", "quick")
+MAX_VIEWPOINTS = 64  # 13 bytes each; more would say nothing new
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,7 @@ class TrainingConfig:
         0.8  # of the steps before the likelihood sees symbols in place of noise (soft then hard)
     )
     left_out: float = 0.2  # of the primitives, that a step does without, where training views are few
+    viewpoints: int = 12  # cameras of training views that the file keeps, to look from; 0: none
     checkpoint_minutes: float = (
         5.0  # between two checkpoints; one is also written when the run is interrupted
     )
@@ -260,6 +262,7 @@ def check_config(config: Config) -> None:
         ("training.head_warm_up", 0 <= t.head_warm_up <= 1, "0 to 1"),
         ("training.sparse_adam", isinstance(t.sparse_adam, bool), "true or false"),
         ("training.appearance_dtype", t.appearance_dtype in ("float32", "bfloat16"), "float32 or bfloat16"),
+        ("training.viewpoints", 0 <= t.viewpoints <= MAX_VIEWPOINTS, f"0 to {MAX_VIEWPOINTS}"),
         ("training.checkpoint_minutes", 0 < t.checkpoint_minutes < 1e6, "above 0"),
         ("control.start", 0 <= c.start <= 1, "0 to 1"),
         ("control.start_passes", c.start_passes is None or 0 < c.start_passes < 1e6, "above 0"),

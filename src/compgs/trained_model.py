@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor, nn
 
+from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.entropy.models import EntropyModel, Quantized, starting_residuals
 from compgs.entropy.quantization import quantize_weight
@@ -53,6 +54,9 @@ class TrainedModel(nn.Module):
         self.distance_unit = distance_unit
         self.background = background
         self.world_offset = world_offset
+        # Cameras of the world that stand for all that the scene was trained on, the first for them best; its sky.
+        self.viewpoints: tuple[Camera, ...] = ()
+        self.up: tuple[float, float, float] = (0.0, -1.0, 0.0)
         self.heads = PredictionHeads(m.reference_dim, m.residual_dim, m.width, m.heads)
         self.entropy = EntropyModel(m, config.entropy)
         self.register_buffer("coordinates", coordinates.to(torch.int32))
@@ -180,6 +184,8 @@ class TrainedModel(nn.Module):
             self.distance_unit,
             self.background,
             world_offset=self.world_offset,
+            viewpoints=self.viewpoints[: self.config.training.viewpoints],
+            up=self.up,
         )
 
     @torch.no_grad()

@@ -3,6 +3,7 @@
 Everything up to the latents is integer arithmetic (reader.py); here they become floats, once.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from compgs.codec.content import Dimensions, FileContent, Latents, Role
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.codec.reader import read_latents
+from compgs.codec.viewpoint_cameras import camera_from_viewpoint
 from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.prediction import SHARED_RESIDUALS, PredictionHeads
@@ -81,9 +83,18 @@ def from_latents(content: FileContent, latents: Latents, device: torch.device) -
         anchor_index=torch.from_numpy(anchor_index).to(device),
         voxel_size=content.voxel_size,
     )
-    return HybridModel(
-        primitives, heads.requires_grad_(False).to(device), content.view_distance_scale, content.background
+    model = HybridModel(
+        primitives,
+        heads.requires_grad_(False).to(device),
+        content.view_distance_scale,
+        content.background,
+        world_offset=content.world_offset,
     )
+    if content.viewpoints is None:
+        return model
+    views, offset = content.viewpoints.views, content.world_offset
+    cameras = tuple(camera_from_viewpoint(view, offset) for view in views)
+    return replace(model, viewpoints=cameras, up=content.viewpoints.up)
 
 
 def _floats(d: Dimensions, latents: Latents, role: Role) -> torch.Tensor:

@@ -17,6 +17,8 @@ from compgs import __version__
 from compgs.codec.content import LOG_SCALES, FileContent, Group, GroupShape, Role
 from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork, evaluate
 from compgs.codec.tables import HyperTable, hyper_tables
+from compgs.codec.viewpoint_cameras import viewpoints_from_cameras
+from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 from compgs.codec.writer import Geometry, write_content
 from compgs.entropy.factorized import FactorizedDensity
@@ -70,10 +72,6 @@ def to_content(model: TrainedModel) -> FileContent:
     for name, parameter in model.named_parameters():
         if not torch.isfinite(parameter).all():
             raise NotEncodable(f"{name} holds values that are not finite: the training has diverged")
-    if any(model.world_offset):
-        raise NotEncodable(
-            f"the model counts positions from {model.world_offset}, which this version of the file cannot hold"
-        )
     kept = model.mask.any(1).cpu()
     if not kept.any():
         raise NotEncodable("no coupled primitive exists: there is nothing to encode")
@@ -103,7 +101,7 @@ def to_content(model: TrainedModel) -> FileContent:
         heads_layout=m.heads,
         width=m.width,
         voxel_size=model.voxel_size,
-        world_offset=(0.0, 0.0, 0.0),
+        world_offset=model.world_offset,
         view_distance_scale=model.distance_unit,
         background=model.background,
         coordinates=model.coordinates.cpu()[kept].numpy(),
@@ -119,8 +117,14 @@ def to_content(model: TrainedModel) -> FileContent:
             for coded in groups
         ),
         heads=tuple(heads),
+        viewpoints=_viewpoints(model),
         metadata={"creator": f"compgs {__version__}"},
     )
+
+
+def _viewpoints(model: TrainedModel) -> Viewpoints | None:
+    cameras = model.viewpoints[: model.config.training.viewpoints]
+    return viewpoints_from_cameras(cameras, model.up, model.world_offset) if cameras else None
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,8 @@ class HybridModel:
         0.0,
         0.0,
     )  # world units, float64: origin of the local frame
+    viewpoints: tuple[Camera, ...] = ()  # of the world: where to look from, the best first
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # direction of the sky
 
     @property
     def anchors(self) -> int:

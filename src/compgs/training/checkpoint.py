@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor, nn
 
+from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
 from compgs.errors import CheckpointError, OutputError
 from compgs.scene.views import Scene
@@ -21,7 +23,7 @@ from compgs.trained_model import TrainedModel
 from compgs.training.decorrelation import keep_channels
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
-CHECKPOINT_VERSION = "1"
+CHECKPOINT_VERSION = "2"
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
                 "voxel_size": model.voxel_size,
                 "distance_unit": model.distance_unit,
                 "background": list(model.background),
+                "viewpoints": [_camera_entry(camera) for camera in model.viewpoints],
+                "up": list(model.up),
                 "world_offset": list(model.world_offset),
             }
         ),
@@ -86,12 +90,22 @@ def load_checkpoint(path: Path) -> Checkpoint:
         scene["voxel_size"],
         scene["distance_unit"],
         tuple(scene["background"]),
-        tuple(scene.get("world_offset", (0.0, 0.0, 0.0))),  # older checkpoints have none
+        tuple(scene["world_offset"]),
     )
+    model.viewpoints = tuple(_camera(entry) for entry in scene["viewpoints"])
+    model.up = tuple(scene["up"])
     channels = parts["model"]["references"].shape[1]
     keep_channels(model, torch.arange(model.reference_dim) < channels)
     model.load_state_dict(parts["model"])
     return Checkpoint(model, parts["optimizer"], parts["extra"], json.loads(metadata["state"]))
+
+
+def _camera_entry(camera: Camera) -> dict[str, Any]:
+    return {**vars(camera), "world_to_camera": np.asarray(camera.world_to_camera, np.float64).tolist()}
+
+
+def _camera(entry: dict[str, Any]) -> Camera:
+    return Camera(**{**entry, "world_to_camera": np.array(entry["world_to_camera"], np.float64)})
 
 
 def read_checkpoint_file(path: Path, method: str) -> tuple[dict[str, Tensor], dict[str, str]]:

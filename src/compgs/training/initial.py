@@ -4,9 +4,10 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from compgs.config import Config
+from compgs.config import MAX_VIEWPOINTS, Config
 from compgs.errors import ConfigError
 from compgs.scene.points import colors_at, median_spacing, voxel_grid
+from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
@@ -22,6 +23,7 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
     Raises ConfigError if the voxel size that was asked for gives more than `max_anchors`.
     """
     m = config.model
+    cameras = [view.camera for view in scene.train_views]
     offset = world_offset(scene)
     scene = local_scene(scene, offset)
     wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
@@ -50,6 +52,9 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
             logits = torch.from_numpy(logit(colors_at(scene.points, model.positions().numpy()))).float()
             model.heads.pass_colors(logits.mean(0))
             model.references[:, :3] = (logits - logits.mean(0)) / config.entropy.reference_step
+    if cameras:
+        model.viewpoints = tuple(cameras[i] for i in choose_viewpoints(cameras, MAX_VIEWPOINTS))
+        model.up = up_direction(cameras)
     return model
 
 
