@@ -13,7 +13,18 @@ import compgs
 SOURCE = Path(compgs.__file__).parent
 
 # A part may import itself, and the parts named here.
-BASE = {"compgs", "linear", "vector_sums", "errors", "gaussians", "cameras", "config", "outputs", "presets"}
+BASE = {
+    "compgs",
+    "linear",
+    "vector_sums",
+    "errors",
+    "gaussians",
+    "cameras",
+    "config",
+    "interrupt",
+    "outputs",
+    "presets",
+}
 ALLOWED = {
     "compgs": {
         "errors",
@@ -27,6 +38,7 @@ ALLOWED = {
         "evaluation",
     },
     "errors": set(),
+    "interrupt": set(),
     "outputs": {"errors"},
     "gaussians": set(),
     "cameras": set(),

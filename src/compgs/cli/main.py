@@ -1,7 +1,7 @@
 """`compgs`: dispatch to a command; errors become one clear message and an exit code.
 
 Exit codes: 0 done; 1 something is wrong with the input, the output or the file; 2 the command line could not be
-understood, or has a value that is out of range; 130 stopped by the user.
+understood, or has a value that is out of range; 130 stopped by the user (Ctrl-C), 143 by the system (SIGTERM).
 """
 
 import sys
@@ -23,6 +23,7 @@ from compgs.cli.render import Render
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError
 from compgs.errors import CompGSError
+from compgs.interrupt import Terminated, ended_on_request, held_back
 
 COMMANDS: tuple[type[Command], ...] = (Train, Encode, Decode, Render, Evaluate, Info, DemoScene)
 
@@ -70,14 +71,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(command: Command) -> int:
     """The exit code; unexpected exceptions, which are our mistakes, keep their traceback."""
     try:
-        command.run()
+        with ended_on_request():
+            command.run()
     except (CompGSError, OSError, MemoryError) as error:
         if command.debug:
             raise
         return fail(error)
     except KeyboardInterrupt as stop:
-        errors.print(escape(str(stop) or "interrupted"))
-        return 130
+        with held_back():
+            errors.print(escape(str(stop) or "interrupted"))
+        return 143 if isinstance(stop, Terminated) else 130
     return 0
 
 
