@@ -8,9 +8,11 @@ import struct
 import subprocess
 import sys
 import termios
+from pathlib import Path
 
 import pytest
 
+GOLDEN_FILE = Path(__file__).parent.parent / "golden" / "tiny.cgs"
 UTF8 = {"LANG": "C.UTF-8", "LC_ALL": "C.UTF-8", "PYTHONUTF8": "1", "TERM": "xterm-256color"}
 ASCII = {
     "LANG": "C",
@@ -91,3 +93,23 @@ def test_a_mistake_is_one_clear_line_on_a_color_terminal(arguments: list[str], c
     code, shown = in_a_terminal(*arguments)
     help_line = f"compgs {arguments[0]} --help shows what it takes"
     assert (code, COLORS.sub("", shown)) == (2, f"error: {complaint}\n{help_line}\n")
+
+
+@pytest.mark.parametrize("locale", [UTF8, ASCII], ids=["UTF-8", "ASCII"])
+@pytest.mark.parametrize(
+    "name", [b"\xc3\xbcber.cgs", b"caf\xe9.cgs"], ids=["a name in UTF-8", "a name that is none"]
+)
+def test_any_name_can_be_shown(tmp_path: Path, locale: dict[str, str], name: bytes) -> None:
+    file = tmp_path / os.fsdecode(name)
+    file.write_bytes(GOLDEN_FILE.read_bytes())
+    code, out, err = in_a_pipe("info", str(file), locale=locale)
+    assert (code, err) == (0, "") and out.startswith(str(tmp_path))
+    code, out, err = in_a_pipe("info", f"{file}.gone", locale=locale)
+    assert (code, out) == (1, "") and err.endswith("there is no such file\n") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"]], ids=" ".join)
+def test_help_can_be_read_where_only_ascii_can_be_shown(arguments: list[str]) -> None:
+    code, out, err = in_a_pipe(*arguments, locale=ASCII)
+    assert (code, err) == (0, "")
+    assert out.isascii() and "\\u" not in out and "\\x" not in out

@@ -13,7 +13,7 @@ from rich.table import Table
 from compgs import __version__
 from compgs.cli.arguments import command_name, parse_command
 from compgs.cli.command import Command
-from compgs.cli.console import console, errors
+from compgs.cli.console import console, errors, show_whatever_can_be_shown
 from compgs.cli.decode import Decode
 from compgs.cli.demo_scene import DemoScene
 from compgs.cli.encode import Encode
@@ -53,6 +53,7 @@ def parse(words: Sequence[str]) -> Command:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    show_whatever_can_be_shown()
     if given in (["--version"], ["-V"]):
         print(f"compgs {__version__}")
         return 0
