@@ -1,10 +1,11 @@
 """The public face of rendering: a decoded or trained scene, seen from a camera."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 
 from compgs.cameras import Camera
+from compgs.errors import ConfigError
 from compgs.gaussians import Gaussians
 from compgs.render.rasterize import rasterize, rasterize_parts
 from compgs.render.result import RasterResult
@@ -12,6 +13,7 @@ from compgs.render.settings import RasterSettings
 from compgs.render.visibility import visible_mask
 
 
+@runtime_checkable
 class Renderable(Protocol):
     """Anything that says which Gaussians a camera sees.
 
@@ -25,9 +27,28 @@ class Renderable(Protocol):
     def gaussians(self, camera: Camera) -> Gaussians: ...
 
 
+@runtime_checkable
+class Trained(Protocol):
+    """What training gives: it can be rendered as what a decoder would make of it."""
+
+    def as_hybrid_model(self) -> Renderable: ...
+
+
 @torch.no_grad()
-def render(model: Renderable, camera: Camera, settings: RasterSettings | None = None) -> RasterResult:
-    """One view of a scene, without gradients. By default over the model's own background."""
+def render(
+    model: Renderable | Trained, camera: Camera, settings: RasterSettings | None = None
+) -> RasterResult:
+    """One view of a scene, without gradients. By default over the model's own background.
+
+    A trained model is quantized anew for each view; for many views, render its `as_hybrid_model()`. Raises ConfigError
+    for what is no model.
+    """
+    if isinstance(model, Trained):
+        model = model.as_hybrid_model()
+    if not isinstance(model, Renderable):
+        raise ConfigError(
+            f"model: expected what compgs.train or compgs.decode gives, found {type(model).__name__}"
+        )
     settings = settings or RasterSettings(background=model.background)
     bounds = getattr(model, "bounds", None)
     if bounds is None:

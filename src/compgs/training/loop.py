@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.config import TrainingConfig
+from compgs.config import Config, TrainingConfig, check_config, load_config
 from compgs.errors import ConfigError, TrainingError
 from compgs.interrupt import held_back
 from compgs.losses import Target
@@ -72,6 +72,21 @@ class Trains(Protocol):
 def chosen_device(device: str | torch.device | None) -> torch.device:
     """The given one, else CUDA where there is one."""
     return torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+
+
+def chosen_config(config: Config | None, preset: str | None) -> Config:
+    """The given one, or a preset's; of neither, the preset `default`. Raises ConfigError for both, or a bad one."""
+    if config is not None and preset is not None:
+        raise ConfigError(
+            f"config and preset={preset!r} were both given: give one; compgs.load_config({preset!r}) is a config"
+        )
+    if config is not None and not isinstance(config, Config):
+        raise ConfigError(
+            f"config: expected what compgs.load_config gives, found {config!r}; a preset is given as preset='quick'"
+        )
+    chosen = config or load_config(preset or "default")
+    check_config(chosen)
+    return chosen
 
 
 def checkpoint_path(output: str | Path | None, *, resume: bool) -> Path | None:

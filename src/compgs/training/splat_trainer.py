@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from compgs.config import Config, check_config, config_from_dict, load_config
+from compgs.config import Config, config_from_dict
 from compgs.errors import ConfigError, TrainingError
 from compgs.losses import Target, photometric_loss
 from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
 from compgs.render import RasterSettings, rasterize, visible_mask
+from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.training.checkpoint import (
     check_same_run,
@@ -32,6 +33,7 @@ from compgs.training.loop import (
     StepResult,
     TrainingStatus,
     checkpoint_path,
+    chosen_config,
     chosen_device,
     kept_target,
     next_view,
@@ -52,10 +54,10 @@ STORED_NUMBERS = 3 + 3 + 3 + 1 + 3 + 4
 
 
 def train_splats(
-    scene: Scene,
+    scene: Scene | str | Path,
     config: Config | None = None,
     *,
-    preset: str = "default",
+    preset: str | None = None,
     output: str | Path | None = None,
     resume: bool = False,
     on_progress: Callable[[TrainingStatus], None] | None = None,
@@ -68,8 +70,8 @@ def train_splats(
 
     Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
     """
-    config = config or load_config(preset)
-    check_config(config)
+    config = chosen_config(config, preset)
+    scene = as_scene(scene)
     chosen = chosen_device(device)
     path = checkpoint_path(output, resume=resume)
     if resume and path:
