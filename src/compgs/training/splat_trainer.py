@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from compgs.config import Config, config_from_dict
-from compgs.errors import ConfigError, TrainingError
+from compgs.errors import ConfigError
 from compgs.losses import Target, photometric_loss
 from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
 from compgs.render import RasterSettings, rasterize, visible_mask
@@ -41,6 +41,7 @@ from compgs.training.loop import (
 )
 from compgs.training.optimizers import exponential_decay, set_learning_rates
 from compgs.training.profile import NoProfile, StepProfile
+from compgs.training.seen_points import check_points_seen
 from compgs.training.splat_parameters import (
     SplatParameters,
     initial_splats,
@@ -178,11 +179,7 @@ class SplatTrainer:
 
     def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
-        bounds = self.parameters.means.detach(), splat_radii(self.parameters.splats())
-        if not any(visible_mask(*bounds, v.camera, self.settings).any() for v in self.scene.train_views):
-            raise TrainingError(
-                f"{self.scene.name}: no view sees any of the scene's points; are the poses right?"
-            )
+        check_points_seen(self.scene, self.settings.near_plane)
         run_to_end(self, self.config.training, path, on_progress)
 
     def estimated_bytes(self) -> int:

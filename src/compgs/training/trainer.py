@@ -55,6 +55,7 @@ from compgs.training.loop import (
 from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rates, step_rows
 from compgs.training.profile import NoProfile, StepProfile
 from compgs.training.rate_control import LOOKS, RateState, due, follow
+from compgs.training.seen_points import check_points_seen
 
 # With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
 FEW_DRAWN = 0.1
@@ -302,11 +303,7 @@ class Trainer:
 
     def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
-        if not any(len(self.visible_anchors(view.camera)) for view in self.scene.train_views):
-            raise TrainingError(
-                f"{self.scene.name}: no view sees any of the scene's points from farther than "
-                f"{self.settings.near_plane} world units; are the poses right, and the unit of length?"
-            )
+        check_points_seen(self.scene, self.settings.near_plane)
         run_to_end(self, self.config.training, path, on_progress)
 
     @property
