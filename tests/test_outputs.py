@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from compgs.cli.main import main
+from compgs.cli.usage import in_words_of_options
 from compgs.errors import OutputError
 from compgs.outputs import check_output_file, check_output_folder, write_bytes, write_json
 
@@ -151,3 +153,15 @@ def test_names_that_are_not_text_survive_json(tmp_path: Path) -> None:
     name = os.fsdecode(b"caf\xe9 \xc3\xbc.jpg")
     write_json(tmp_path / "a.json", {"name": name})
     assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == {"name": name}
+
+
+def test_python_is_told_which_argument_to_give_and_a_terminal_which_option(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x").touch()
+    for check, place in ((check_output_file, tmp_path / "x"), (check_output_folder, tmp_path)):
+        with pytest.raises(OutputError, match=r"or give overwrite=True$"):
+            check(place)
+    assert in_words_of_options("training.target_bytes = 1: too few") == "--target-size 1: too few"
+    assert main(["demo-scene", str(tmp_path)]) == 1
+    assert capsys.readouterr().err.endswith("choose another folder or give --overwrite\n")

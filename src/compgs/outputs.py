@@ -19,7 +19,7 @@ def check_output_file(path: Path, *, overwrite: bool = False, needed_bytes: int 
     if path.is_dir():
         raise OutputError(f"{path}: expected a file to write, found a folder; name a file inside it")
     if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists already; choose another name or give --overwrite")
+        raise OutputError(f"{path}: exists already; choose another name or give overwrite=True")
     _check_place(path.parent, needed_bytes)
 
 
@@ -29,7 +29,7 @@ def check_output_folder(folder: Path, *, overwrite: bool = False, needed_bytes: 
         raise OutputError(f"{folder}: expected a folder to write to, found a file; choose another name")
     if folder.is_dir() and not overwrite and _holds_something(folder):
         raise OutputError(
-            f"{folder}: exists already and is not empty; choose another folder or give --overwrite"
+            f"{folder}: exists already and is not empty; choose another folder or give overwrite=True"
         )
     _check_place(folder, needed_bytes)
 

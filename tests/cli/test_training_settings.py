@@ -264,7 +264,7 @@ def test_options_that_say_what_a_run_began_with_are_no_contradiction(tmp_path: P
 
 def test_a_run_that_began_in_python_is_sent_back_there(tmp_path: Path) -> None:
     (tmp_path / CHECKPOINT_NAME).touch()
-    with pytest.raises(CheckpointError, match=r"compgs\.train\(scene, config, output=.*, resume=True\)"):
+    with pytest.raises(CheckpointError, match=r"began in Python .* compgs\.train with the same scene"):
         train("-o", tmp_path, "--resume").settings(tmp_path)
 
 

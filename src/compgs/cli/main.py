@@ -21,7 +21,7 @@ from compgs.cli.evaluate import Evaluate
 from compgs.cli.info import Info
 from compgs.cli.render import Render
 from compgs.cli.train import Train
-from compgs.cli.usage import UsageError
+from compgs.cli.usage import UsageError, in_words_of_options
 from compgs.errors import CompGSError
 from compgs.interrupt import Terminated, ended_on_request, held_back
 
@@ -98,7 +98,7 @@ def explain(error: Exception) -> str:
     if isinstance(error, OSError):
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{error.strerror or error}"
-    return str(error)
+    return in_words_of_options(str(error))
 
 
 if __name__ == "__main__":

@@ -143,7 +143,7 @@ def load_settings(folder: Path) -> RunSettings:
         if (folder / CHECKPOINT_NAME).is_file():
             raise CheckpointError(
                 f"{path}: not found, so it is not known how the scene was read; a run that began in Python goes on "
-                f"there: compgs.train(scene, config, output={str(folder)!r}, resume=True)"
+                f"there, by compgs.train with the same scene and settings, output and resume"
             ) from error
         raise CheckpointError(
             f"{path}: not found; {folder} is not a run that `compgs train` began"

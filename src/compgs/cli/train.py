@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, one_scene
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, check_lpips, one_scene
 from compgs.cli.console import duration, print_profile, print_results, say, size
 from compgs.cli.methods import METHODS, check_settings_of
 from compgs.cli.progress import counting, training
@@ -111,7 +111,7 @@ class Train(ComputingCommand, SceneOptions):
     """Print where a step's time goes; training.json has it too."""
 
     lpips: FlagCreatePairsOff[bool] = False
-    """Also measure LPIPS (needs `pip install 'compgs[lpips]'`)."""
+    """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
 
     def run(self) -> None:
         if self.output is None:
@@ -124,6 +124,8 @@ class Train(ComputingCommand, SceneOptions):
         check_output_folder(folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES)
         settings = self.settings(folder)
         self.prepare()
+        if self.lpips:
+            check_lpips()
         if self.resume:
             say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
         scene = read_scene(settings.scene)
@@ -270,7 +272,13 @@ def say_miss(folder: Path, target: int) -> None:
     facts = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     write_json(path, {**facts, "target_bytes": target, "bytes": written, "miss": miss})
     if abs(miss) > NOTABLE_MISS:
-        lmbda = f"lambda ended at {facts['lmbda']:.3g}, within 1e-05 to 1" if "lmbda" in facts else "lambda"
+        from compgs.training.rate_control import HIGHEST, LOWEST
+
+        lmbda = (
+            f"lambda ended at {facts['lmbda']:.3g}, within {LOWEST:g} to {HIGHEST:g}"
+            if "lmbda" in facts
+            else "lambda"
+        )
         way = "fewer anchors (model.voxel_spacings)" if miss > 0 else "more anchors (model.voxel_spacings)"
         say(
             f"note: {size(written)} is what these settings reached ({lmbda}); more --steps let it settle, "

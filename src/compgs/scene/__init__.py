@@ -9,7 +9,7 @@ import numpy as np
 
 from compgs.errors import ConfigError, MissingSparseModel, SceneError
 from compgs.scene.blender import read_blender
-from compgs.scene.capture import Capture, PosedImage
+from compgs.scene.capture import Capture, PosedImage, check_inside
 from compgs.scene.colmap import find_sparse_model
 from compgs.scene.colmap_capture import read_colmap
 from compgs.scene.images import Progress, image_size, load_views
@@ -41,6 +41,8 @@ def load_scene(
     folder = Path(path)
     capture = _read_layout(folder, images)
     _check_views(capture, folder)
+    for posed in capture.images:
+        check_inside(posed.path, (folder, folder / images), f"the image of the view {posed.name!r}")
     capture, downscale = _prescaled(capture, folder, images, downscale)
 
     behind = background or capture.background
