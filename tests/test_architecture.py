@@ -14,7 +14,7 @@ SOURCE = Path(compgs.__file__).parent
 
 # A part may import itself, and the parts named here.
 BASE = {
-    "compgs", "linear", "vector_sums", "rotations", "errors", "gaussians", "cameras", "config", "outputs", "presets",
+    "compgs", "linear", "vector_sums", "rotations", "errors", "gaussians", "cameras", "config", "interrupt", "outputs", "presets",
 }  # fmt: skip
 ALLOWED = {
     "compgs": {
@@ -29,6 +29,7 @@ ALLOWED = {
         "evaluation",
     },
     "errors": set(),
+    "interrupt": set(),
     "outputs": {"errors"},
     "gaussians": set(),
     "cameras": set(),

@@ -98,7 +98,7 @@ def test_lpips_is_zero_for_identical_images_and_grows_with_the_disturbance():
 def test_lpips_without_its_packages_names_the_extra_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "torchvision", None)
     metrics.lpips_network.cache_clear()
-    with pytest.raises(metrics.Unavailable, match=r"pip install compgs\[lpips\]"):
+    with pytest.raises(metrics.Unavailable, match=r"pip install '\.\[lpips\]' in the project's folder"):
         metrics.lpips(PHOTOGRAPH, PHOTOGRAPH)
     assert issubclass(metrics.Unavailable, CompGSError)
 

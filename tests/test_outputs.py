@@ -4,10 +4,14 @@ import json
 import os
 import shutil
 from collections import namedtuple
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
+from compgs.cli.main import main
+from compgs.cli.usage import in_words_of_options
 from compgs.errors import OutputError
 from compgs.outputs import check_output_file, check_output_folder, write_bytes, write_json
 
@@ -80,3 +84,84 @@ def test_a_failed_write_keeps_the_old_file_and_no_remains(
         write_bytes(file, b"half of it")
     assert json.loads(file.read_text()) == {"psnr": 1.5}
     assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
+
+
+@pytest.fixture(params=["bytes", "checkpoint"])
+def write(request: pytest.FixtureRequest) -> Callable[[Path], None]:
+    """Both ways of writing a file."""
+    if request.param == "bytes":
+        return lambda path: write_bytes(path, b"new")
+    from compgs.training.checkpoint import write_checkpoint_file
+
+    return lambda path: write_checkpoint_file(path, "compgs", {"a": torch.zeros(3)}, {})
+
+
+def test_temporary_names_cannot_be_foreseen_and_no_link_is_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[Path], None]
+) -> None:
+    names: list[str] = []
+    real = os.replace
+    monkeypatch.setattr(os, "replace", lambda a, b: (names.append(Path(a).name), real(a, b)))
+    file, victim = tmp_path / "a.cgs", tmp_path / "victim"
+    victim.write_bytes(b"precious")
+    for planted in ("a.cgs.partial", ".a.cgs.partial"):
+        (tmp_path / planted).symlink_to(victim)
+    write(file)
+    write(file)
+    assert len(set(names)) == 2 and all(name.startswith(".a.cgs.") for name in names)
+    assert victim.read_bytes() == b"precious"
+
+
+def test_even_a_foreseen_link_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[Path], None]
+) -> None:
+    victim = tmp_path / "victim"
+    victim.write_bytes(b"precious")
+    monkeypatch.setattr("secrets.token_hex", lambda _: "0" * 16)
+    (tmp_path / f".a.cgs.{'0' * 16}.partial").symlink_to(victim)
+    with pytest.raises(OutputError, match=r"a\.cgs"):
+        write(tmp_path / "a.cgs")
+    assert victim.read_bytes() == b"precious"
+    assert not (tmp_path / "a.cgs").exists()
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o007, 0o660)])
+def test_written_files_are_readable_for_whom_the_umask_says(
+    tmp_path: Path, write: Callable[[Path], None], umask: int, mode: int
+) -> None:
+    before = os.umask(umask)
+    try:
+        write(tmp_path / "a.cgs")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a.cgs").stat().st_mode & 0o777 == mode
+
+
+def test_an_interrupted_write_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[Path], None]
+) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "a.cgs")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_names_that_are_not_text_survive_json(tmp_path: Path) -> None:
+    name = os.fsdecode(b"caf\xe9 \xc3\xbc.jpg")
+    write_json(tmp_path / "a.json", {"name": name})
+    assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == {"name": name}
+
+
+def test_python_is_told_which_argument_to_give_and_a_terminal_which_option(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x").touch()
+    for check, place in ((check_output_file, tmp_path / "x"), (check_output_folder, tmp_path)):
+        with pytest.raises(OutputError, match=r"or give overwrite=True$"):
+            check(place)
+    assert in_words_of_options("training.target_bytes = 1: too few") == "--target-size 1: too few"
+    assert main(["demo-scene", str(tmp_path)]) == 1
+    assert capsys.readouterr().err.endswith("choose another folder or give --overwrite\n")

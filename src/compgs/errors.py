@@ -52,6 +52,11 @@ class MissingDependency(ConfigError):
     """An optional dependency is needed; the message has the install line."""
 
 
+def install_line(extra: str) -> str:
+    """How an optional dependency is installed. The project's folder is named: no package index has this package."""
+    return f"pip install '.[{extra}]' in the project's folder"
+
+
 class OutputError(CompGSError):
     """The output exists already, or cannot be written."""
 

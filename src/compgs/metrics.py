@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.errors import MissingDependency
+from compgs.errors import MissingDependency, install_line
 from compgs.ssim import l1_and_ssim
 
 # Distance of two batches [1, 3, H, W] in [-1, 1].
@@ -83,7 +83,7 @@ def lpips_network(name: Literal["vgg", "alex"]) -> LpipsNetwork:
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     except (ImportError, RuntimeError) as error:  # a torchvision for another torch fails with RuntimeError
         raise Unavailable(
-            f"LPIPS needs torchmetrics and torchvision ({error}): pip install compgs[lpips]"
+            f"LPIPS needs torchmetrics and torchvision ({error}): {install_line('lpips')}"
         ) from error
     models = torchvision.models
     weights = {"vgg": models.VGG16_Weights, "alex": models.AlexNet_Weights}[name].IMAGENET1K_V1

@@ -4,8 +4,10 @@ import contextlib
 import json
 import math
 import os
+import secrets
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ def check_output_file(path: Path, *, overwrite: bool = False, needed_bytes: int 
     if path.is_dir():
         raise OutputError(f"{path}: expected a file to write, found a folder; name a file inside it")
     if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists already; choose another name or give --overwrite")
+        raise OutputError(f"{path}: exists already; choose another name or give overwrite=True")
     _check_place(path.parent, needed_bytes)
 
 
@@ -27,27 +29,46 @@ def check_output_folder(folder: Path, *, overwrite: bool = False, needed_bytes: 
         raise OutputError(f"{folder}: expected a folder to write to, found a file; choose another name")
     if folder.is_dir() and not overwrite and _holds_something(folder):
         raise OutputError(
-            f"{folder}: exists already and is not empty; choose another folder or give --overwrite"
+            f"{folder}: exists already and is not empty; choose another folder or give overwrite=True"
         )
     _check_place(folder, needed_bytes)
 
 
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a new, empty file that takes the place of `path` when the block is done; folders on the way are made.
+
+    Whatever happens inside, `path` is the old file or the whole new one, and nothing else stays. The new file's name
+    cannot be foreseen, and no file or link that is there already is ever opened.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name[:40]}.{secrets.token_hex(8)}.partial")
+    # Readable for whom the user's umask says, unlike the files of `tempfile`.
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    try:
+        mode = temporary.stat().st_mode
+        yield temporary
+        temporary.chmod(mode)  # a writer may have made the file anew, for its own eyes only
+        os.replace(temporary, path)
+    except BaseException:
+        _remove(temporary)
+        raise
+
+
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file whole or not at all; folders on the way are made. Raises OutputError."""
-    temporary = path.with_name(f".{path.name}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            temporary.write_bytes(data)
     except OSError as error:
-        _remove(temporary)
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def write_json(path: Path, content: dict[str, Any] | list[Any]) -> None:
     """JSON for programs, indented for people. JSON has no infinity and no not-a-number: those become null."""
     text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
-    write_bytes(path, (text + "\n").encode())
+    # Names of files need not be text: what is not becomes an escape of JSON, from which it can be read back.
+    write_bytes(path, (text + "\n").encode("utf-8", "backslashreplace"))
 
 
 def _finite(value: Any) -> Any:

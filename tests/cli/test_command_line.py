@@ -192,20 +192,21 @@ def test_values_out_of_range_are_usage_errors_in_the_words_of_the_option(
         (["encode", "full", "-o", "file"], "overwrite"),
         (["encode", "empty", "-o", "out.cgs"], "checkpoint.safetensors"),
         (["encode", "GOLDEN", "--drop", "0.5", "-o", "file"], "overwrite"),
-        (["encode", "file", "--drop", "0.5", "-o", "out.cgs"], "file: header"),
+        (["encode", "file", "--drop", "0.5", "-o", "out.cgs"], "file: is not a .cgs file"),
         (["decode", "nowhere.cgs"], "nowhere.cgs"),
         (["decode", "empty"], "folder"),
         (["decode", "splats.ply"], "rendered and evaluated"),
-        (["decode", "file", "-o", "out"], "file: header"),
+        (["decode", "file", "-o", "out"], "file: is not a .cgs file"),
         (["decode", "GOLDEN", "-o", "full"], "overwrite"),
         (["render", "nowhere.cgs", "-o", "out"], "nowhere.cgs"),
-        (["render", "file", "-o", "out"], "file: header"),
+        (["render", "file", "-o", "out"], "file: is not a .cgs file"),
         (["render", "GOLDEN", "-o", "full"], "overwrite"),
         (["evaluate", "nowhere.cgs", "scene"], "nowhere.cgs"),
-        (["evaluate", "file", "scene"], "file: header"),
+        (["evaluate", "file", "scene"], "file: is not a .cgs file"),
         (["evaluate", "GOLDEN", "scene", "-o", "full"], "overwrite"),
         (["info", "empty"], "folder"),
-        (["info", "file"], "file"),
+        (["info", "file"], "file: is not a .cgs file"),
+        (["info", "nothing"], "nothing: is empty"),
         (["info", "full"], "full/run.cgs"),
         (["demo-scene", "full"], "overwrite"),
         (["demo-scene", "file"], "file"),
@@ -224,6 +225,7 @@ def test_wrong_input_is_one_clear_line_and_nothing_is_written(
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "run.cgs").write_bytes(b"precious")
     (tmp_path / "file").write_bytes(b"something else")
+    (tmp_path / "nothing").touch()
     (tmp_path / "splats.ply").write_bytes(b"ply")
     (tmp_path / "GOLDEN").write_bytes(GOLDEN_FILE.read_bytes())
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
@@ -252,7 +254,35 @@ def test_a_damaged_file_is_refused_before_the_scene_is_read(
         )
         assert code == 1
         assert "a.cgs: metadata: its checksum does not match" in err
+        assert err.endswith("; download or copy the file again\n")
         assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["info", "decode", "render", "evaluate"])
+def test_a_file_that_ends_early_is_to_be_fetched_again(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str
+) -> None:
+    (tmp_path / "a.cgs").write_bytes(GOLDEN_FILE.read_bytes()[:-40])
+    rest = {"render": ["-o", tmp_path / "out"], "evaluate": [tmp_path / "scene"]}.get(command, [])
+    code, _, err = outcome(capsys, command, tmp_path / "a.cgs", *rest)
+    assert code == 1 and err.count("\n") == 1
+    assert err.endswith("; download or copy the file again\n")
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_lpips_is_missed_before_anything_is_computed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str
+) -> None:
+    from compgs import metrics
+
+    monkeypatch.setitem(sys.modules, "torchmetrics", None)
+    metrics.lpips_network.cache_clear()
+    (tmp_path / "a.cgs").write_bytes(GOLDEN_FILE.read_bytes())
+    first = {"train": ["-o", tmp_path / "run"], "evaluate": [tmp_path / "a.cgs"]}[command]
+    code, _, err = outcome(capsys, command, *first, tmp_path / "nowhere", "--lpips")
+    assert code == 1
+    assert err.startswith("error: LPIPS needs") and "pip install '.[lpips]' in the project's folder" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["a.cgs"]
 
 
 def test_a_file_is_encoded_again_only_to_become_a_smaller_one(

@@ -43,10 +43,31 @@ class Status:
     lmbda: float = 0.001
 
 
-def test_a_status_says_rate_loss_quality_anchors_size_and_time_left() -> None:
-    text = progress.describe(Status(10))  # type: ignore[arg-type]
-    assert text == "12.5 steps/s  loss 0.0500  PSNR 27.9 dB  4,211 anchors  ~181.0 kB  lambda 0.001"
-    assert progress.time_left(Status(10)) == "7 s left"  # type: ignore[arg-type]
+def test_a_status_says_what_matters_most_first() -> None:
+    text = "  ".join(progress.parts_of(Status(10)))  # type: ignore[arg-type]
+    assert text == (
+        "step 10 of 100  7 s left  PSNR 27.9 dB  ~181.0 kB  4,211 anchors  12.5 steps/s  loss 0.0500  lambda 0.001"
+    )
+
+
+@pytest.mark.parametrize(
+    ("room", "text"),
+    [
+        (5, "step 10 of 100"),
+        (23, "step 10 of 100"),
+        (24, "step 10 of 100  7 s left"),
+        (38, "step 10 of 100  7 s left  PSNR 27.9 dB"),
+        (67, "step 10 of 100  7 s left  PSNR 27.9 dB  ~181.0 kB  4,211 anchors"),
+    ],
+)
+def test_a_narrow_terminal_loses_whole_parts_from_the_end(room: int, text: str) -> None:
+    assert progress.fitting(Status(10), room) == text  # type: ignore[arg-type]
+
+
+def test_in_80_columns_a_long_run_still_shows_steps_time_left_quality_and_size() -> None:
+    status = Status(12_340, 300_000, psnr=27.94, estimated_bytes=12_340_000)
+    shown = progress.fitting(status, 80 - progress.BAR_WIDTH - 1)  # type: ignore[arg-type]
+    assert shown == "step 12,340 of 300,000  6 h 23 min left  PSNR 27.9 dB  ~12.34 MB"
 
 
 def test_without_a_terminal_progress_is_a_few_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
@@ -57,7 +78,8 @@ def test_without_a_terminal_progress_is_a_few_plain_lines(capsys: pytest.Capture
         for done in range(1, 6):
             count(done, 5)
     lines = capsys.readouterr().out.splitlines()
-    assert [line[:24] for line in lines] == [
+    assert lines[0].startswith("training: compiling")
+    assert [line[:24] for line in lines[1:]] == [
         "training: step 10 of 100",
         "training: step 100 of 10",
         "reading views: 5 of 5",

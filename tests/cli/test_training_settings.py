@@ -17,9 +17,11 @@ from compgs.cli.run_folder import (
     save_settings,
 )
 from compgs.cli.settings import parse_value, with_settings
-from compgs.cli.train import CHECKPOINT_NAME, Train, forget_earlier_run, interrupted, say_miss
+from compgs.cli.train import CHECKPOINT_NAME, Train, interrupted, say_miss
+from compgs.cli.usage import UsageError
 from compgs.config import Config, load_config
 from compgs.errors import CheckpointError, ConfigError, TrainingError
+from compgs.outputs import write_bytes
 
 
 def train(*arguments: object) -> Train:
@@ -154,7 +156,7 @@ def test_a_run_that_fails_after_a_checkpoint_can_be_continued(tmp_path: Path) ->
         (tmp_path / CHECKPOINT_NAME).touch()
         raise TrainingError
     elsewhere = replace(settings, scene=replace(settings.scene, path="elsewhere"))
-    with pytest.raises(TrainingError), beginning(tmp_path, elsewhere):
+    with pytest.raises(TrainingError), beginning(tmp_path, elsewhere, anew=False):
         raise TrainingError
     assert load_settings(tmp_path) == settings
 
@@ -180,11 +182,90 @@ def test_the_file_is_named_after_the_run(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert file_name(Path(".")) == f"{tmp_path.name}.cgs"
 
 
-def test_overwriting_removes_what_could_be_taken_for_the_new_run(tmp_path: Path) -> None:
-    for name in (CHECKPOINT_NAME, "results.json", f"{tmp_path.name}.cgs", "notes.txt"):
-        (tmp_path / name).touch()
-    forget_earlier_run(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+@pytest.fixture
+def finished(tmp_path: Path) -> Path:
+    """The folder of a finished run, with something else in it."""
+    folder = tmp_path / "run"
+    save_settings(folder, train("scene", "-o", folder, "--steps", "5").settings(folder))
+    for name in (CHECKPOINT_NAME, "training.json", "results.json", "run.cgs", "run.ply", "notes.txt"):
+        (folder / name).write_text("earlier")
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("failure", [ConfigError, TrainingError, KeyboardInterrupt])
+def test_a_run_that_replaces_another_leaves_it_as_it_was_until_its_first_checkpoint(
+    finished: Path, failure: type[BaseException]
+) -> None:
+    before = contents(finished)
+    settings = train("other", "-o", finished, "--overwrite").settings(finished)
+    with pytest.raises(failure), beginning(finished, settings) as earlier:
+        assert earlier is not None
+        earlier.look()
+        assert contents(finished) == before
+        assert "is as it was" in interrupted(finished, earlier)
+        raise failure
+    assert contents(finished) == before
+
+
+@pytest.mark.parametrize("checkpoint_was_there", [True, False])
+def test_with_its_first_checkpoint_a_run_takes_the_place_of_the_earlier_one(
+    finished: Path, checkpoint_was_there: bool
+) -> None:
+    if not checkpoint_was_there:
+        (finished / CHECKPOINT_NAME).unlink()
+    settings = train("other", "-o", finished, "--overwrite").settings(finished)
+    with beginning(finished, settings) as earlier:
+        assert earlier is not None
+        write_bytes(finished / CHECKPOINT_NAME, b"new")
+        earlier.look()
+        assert sorted(contents(finished)) == [CHECKPOINT_NAME, "config.json", "notes.txt"]
+        assert load_settings(finished) == settings
+        assert "--resume" in interrupted(finished, earlier)
+        (finished / "run.cgs").write_text("new")
+        earlier.look()
+        assert (finished / "run.cgs").exists()
+
+
+def test_a_checkpoint_that_is_written_at_the_very_end_counts(finished: Path) -> None:
+    settings = train("other", "-o", finished, "--overwrite").settings(finished)
+    with pytest.raises(KeyboardInterrupt), beginning(finished, settings):
+        write_bytes(finished / CHECKPOINT_NAME, b"new")
+        raise KeyboardInterrupt
+    assert load_settings(finished) == settings
+    assert not (finished / "run.cgs").exists()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        ["-r", "2"],
+        ["--images", "photos"],
+        ["--test-every", "4"],
+        ["--no-eval"],
+        ["--background", "1", "0", "0"],
+    ],
+)
+def test_a_scene_is_not_read_otherwise_when_a_run_goes_on(finished: Path, other: list[str]) -> None:
+    with pytest.raises(UsageError, match=rf"{other[0] if other[0] != '-r' else '--downscale'}.*leave it out"):
+        train("-o", finished, "--resume", *other).settings(finished)
+
+
+def test_options_that_say_what_a_run_began_with_are_no_contradiction(tmp_path: Path) -> None:
+    options = ["-r", "2", "--images", "photos", "--test-every", "4", "--no-eval"]
+    begun = train("scene", "-o", tmp_path, *options).settings(tmp_path)
+    save_settings(tmp_path, begun)
+    assert train("-o", tmp_path, "--resume", *options).settings(tmp_path) == begun
+    assert train("-o", tmp_path, "--resume").settings(tmp_path) == begun
+
+
+def test_a_run_that_began_in_python_is_sent_back_there(tmp_path: Path) -> None:
+    (tmp_path / CHECKPOINT_NAME).touch()
+    with pytest.raises(CheckpointError, match=r"began in Python .* compgs\.train with the same scene"):
+        train("-o", tmp_path, "--resume").settings(tmp_path)
 
 
 def test_someone_who_stops_a_run_is_told_how_to_go_on(tmp_path: Path) -> None:

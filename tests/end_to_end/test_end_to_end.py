@@ -1,6 +1,8 @@
 """The main job on a tiny scene: photographs in, one file out, views rendered from it by another process."""
 
 import json
+import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -164,6 +166,17 @@ def test_python_does_the_same_and_the_same_seed_gives_the_same_file(
         assert after == pytest.approx(before, abs=0.01)
 
 
+@contextmanager
+def stopped_half_way() -> Iterator[Callable[[TrainingStatus], None]]:
+    """Instead of the display of a training: its user."""
+
+    def stop(status: TrainingStatus) -> None:
+        if status.step >= STEPS // 2:
+            raise KeyboardInterrupt
+
+    yield stop
+
+
 def test_a_run_that_was_stopped_continues_to_the_same_file(
     run: Path,
     scene_folder: Path,
@@ -171,14 +184,6 @@ def test_a_run_that_was_stopped_continues_to_the_same_file(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    @contextmanager
-    def stopped_half_way() -> Iterator[Callable[[TrainingStatus], None]]:
-        def stop(status: TrainingStatus) -> None:
-            if status.step >= STEPS // 2:
-                raise KeyboardInterrupt
-
-        yield stop
-
     folder = tmp_path / "stopped"
     with monkeypatch.context() as patch:
         patch.setattr(train_command, "training", stopped_half_way)
@@ -189,6 +194,53 @@ def test_a_run_that_was_stopped_continues_to_the_same_file(
     assert "--resume" in capsys.readouterr().err
     assert main(["train", "-o", str(folder), "--resume"]) == 0
     assert (folder / "stopped.cgs").read_bytes() == (run / "tiny.cgs").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)], ids=["SIGTERM", "Ctrl-C"]
+)
+def test_a_process_that_is_asked_to_end_leaves_a_checkpoint_and_the_usual_code(
+    scene_folder: Path, tmp_path: Path, number: signal.Signals, code: int
+) -> None:
+    folder = tmp_path / "asked"
+    command = [
+        sys.executable,
+        "-m",
+        "compgs",
+        "train",
+        str(scene_folder),
+        "-o",
+        str(folder),
+        "--preset",
+        "quick",
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stderr is not None
+        assert any(line.startswith("training: step 10 ") for line in process.stdout)
+        process.send_signal(number)
+        err = process.stderr.read()
+    assert process.returncode == code
+    assert err == (
+        f"interrupted; the checkpoint is {folder / 'checkpoint.safetensors'}\n"
+        f"continue with: compgs train -o {folder} --resume\n"
+    )
+    assert sorted(path.name for path in folder.iterdir()) == ["checkpoint.safetensors", "config.json"]
+
+
+@pytest.mark.parametrize("ending", [["--target-size", "1"], ["--set", "model.voxel_size=1e-9"], ["stopped"]])
+def test_a_finished_run_survives_its_replacement_until_that_has_a_checkpoint(
+    run: Path, scene_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: list[str]
+) -> None:
+    folder = tmp_path / "tiny"
+    shutil.copytree(run, folder)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    if ending == ["stopped"]:
+        monkeypatch.setattr(train_command, "training", stopped_half_way)
+    again = ["train", str(scene_folder), "-o", str(folder), *OPTIONS, "--overwrite"]
+    assert main(again if ending == ["stopped"] else [*again, *ending]) == (
+        130 if ending == ["stopped"] else 1
+    )
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize("damage", ["truncated", "altered", "empty", "something else"])

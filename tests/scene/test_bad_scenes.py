@@ -1,5 +1,8 @@
 """Each kind of bad input is refused with an error that names the file."""
 
+import shutil
+import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +15,7 @@ from compgs.errors import MissingSparseModel, SceneError, UnreadableImage, Unsup
 from compgs.scene import load_scene
 from compgs.scene.colmap import CAMERA_MODELS, ColmapCamera, ColmapImage, read_sparse_model
 from compgs.scene.colmap_writer import write_sparse_model
+from compgs.scene.images import image_size, read_image
 
 Write = Callable[..., Path]
 
@@ -169,3 +173,62 @@ def test_points_that_are_not_finite_are_left_out_with_a_note(write_capture: Writ
     scene = load_scene(folder)
     assert len(scene.points) == 148
     assert "2 points" in scene.notes[0]
+
+
+@pytest.mark.parametrize("name", ["../../elsewhere/00.png", "a/../../../elsewhere/00.png", "ABSOLUTE"])
+def test_images_outside_of_the_scene_are_refused(write_capture: Write, tmp_path: Path, name: str) -> None:
+    folder, elsewhere = write_capture(), tmp_path / "elsewhere"
+    (folder / "images").joinpath("a").mkdir()
+    shutil.copytree(folder / "images", elsewhere)
+    name = str(elsewhere / "00.png") if name == "ABSOLUTE" else name
+    rewrite_images(folder, lambda image: replace(image, name=name))
+    with pytest.raises(
+        SceneError, match=r"capture: the image of the view .* lies outside of the scene's folder"
+    ):
+        load_scene(folder)
+
+
+def test_an_images_folder_that_somebody_names_or_links_to_may_lie_anywhere(
+    write_capture: Write, tmp_path: Path
+) -> None:
+    folder = write_capture()
+    shutil.move(folder / "images", tmp_path / "photographs")
+    assert len(load_scene(folder, images="../photographs").train_views) == 8
+    assert len(load_scene(folder, images=str(tmp_path / "photographs")).train_views) == 8
+    (folder / "images").symlink_to(tmp_path / "photographs")
+    assert len(load_scene(folder).train_views) == 8
+
+
+def test_an_image_that_would_fill_the_memory_is_refused(write_capture: Write) -> None:
+    """A few bytes that say they are 900 million pixels."""
+    folder = write_capture()
+    header = b"IHDR" + struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)
+    data = (
+        struct.pack(">I", 13)
+        + header
+        + struct.pack(">I", zlib.crc32(header))
+        + struct.pack(">I", 9)
+        + b"IDAT"
+    )
+    (folder / "images" / "03.png").write_bytes(b"\x89PNG\r\n\x1a\n" + data + bytes(13))
+    with pytest.raises(UnreadableImage, match=r"03\.png.*exceeds limit.*smaller copies"):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("reading", [image_size, lambda file: read_image(file, (0.0, 0.0, 0.0))])
+def test_a_program_that_is_called_an_image_is_not_run(
+    tmp_path: Path, reading: Callable[[Path], object]
+) -> None:
+    """PostScript, which Pillow hands to Ghostscript."""
+    Image.new("RGB", (24, 16)).save(tmp_path / "a.eps")
+    (tmp_path / "a.eps").rename(tmp_path / "a.png")
+    with pytest.raises(UnreadableImage, match=r"a\.png.*cannot identify"):
+        reading(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tif", "bmp", "ppm", "tga", "mpo"])
+def test_usual_formats_are_read(tmp_path: Path, suffix: str) -> None:
+    file = tmp_path / f"a.{suffix}"
+    Image.new("RGB", (24, 16), (200, 100, 50)).save(file)
+    assert image_size(file) == (24, 16)
+    assert np.abs(read_image(file, (0.0, 0.0, 0.0)).mean((0, 1)) - (200, 100, 50)).max() < 4

@@ -1,10 +1,13 @@
+import signal
 from dataclasses import replace
 
 import pytest
 import torch
 
 from compgs.errors import CheckpointError
+from compgs.interrupt import Terminated, ended_on_request, held_back
 from compgs.training.checkpoint import load_checkpoint
+from compgs.training.loop import Pace
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -81,15 +84,112 @@ def test_a_failed_write_keeps_the_previous_checkpoint(blob_scene, tiny_config, t
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-def test_ctrl_c_inside_a_step_waits_for_its_end():
-    import signal
-
-    from compgs.training.interrupt import held_back
-
+@pytest.mark.parametrize(
+    ("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)]
+)
+def test_a_stop_inside_a_step_waits_for_its_end(number, kind):
     done = []
-    with pytest.raises(KeyboardInterrupt), held_back():
-        signal.raise_signal(signal.SIGINT)
+    with pytest.raises(kind) as stop, ended_on_request(), held_back():
+        signal.raise_signal(number)
+        signal.raise_signal(number)
         done.append("the rest of the step")
+    assert stop.type is kind
     assert done == ["the rest of the step"]
     with held_back():
         done.append("no interrupt, no exception")
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_an_interrupt_that_is_ignored_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with held_back():
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_second_ctrl_c_waits_for_the_checkpoint(blob_scene, tiny_config, tmp_path, monkeypatch):
+    path = tmp_path / "checkpoint.safetensors"
+    trainer = Trainer(blob_scene, tiny_config, CPU)
+    save = trainer.save
+
+    def impatient(where):
+        signal.raise_signal(signal.SIGINT)
+        save(where)
+
+    monkeypatch.setattr(trainer, "save", impatient)
+
+    def stop(status):
+        if status.step == 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run(path, stop)
+    assert load_checkpoint(path).state["step"] == 10
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def stopped_at_10(status):
+    if status.step >= 10:
+        raise KeyboardInterrupt
+
+
+def test_a_run_that_is_stopped_at_once_leaves_the_checkpoint_of_an_earlier_run(
+    blob_scene, tiny_config, tmp_path
+):
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(b"of an earlier run")
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(blob_scene, tiny_config, CPU).run(path, stopped_at_10)
+    assert path.read_bytes() == b"of an earlier run"
+
+
+def test_after_its_first_checkpoint_a_run_keeps_its_own(blob_scene, tiny_config, tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(b"of an earlier run")
+    config = replace(tiny_config, training=replace(tiny_config.training, checkpoint_minutes=1e-9))
+    found = []
+
+    def look(status):
+        found.append(load_checkpoint(path).state["step"] == status.step)
+        stopped_at_10(status)
+
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(blob_scene, config, CPU).run(path, look)
+    assert found == [True] * 10  # a report follows each checkpoint at once
+    assert load_checkpoint(path).state["step"] == 10
+
+
+def test_a_continued_run_keeps_what_it_did_when_it_is_stopped_again(blob_scene, tiny_config, tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(blob_scene, tiny_config, CPU).run(path, stopped_at_10)
+    with pytest.raises(KeyboardInterrupt):
+        Trainer.resumed(blob_scene, load_checkpoint(path), tiny_config, CPU).run(path, stopped_at_10)
+    assert load_checkpoint(path).state["step"] == 20
+
+
+def test_the_pace_is_that_of_the_steps_without_compilation_and_checkpoints(monkeypatch):
+    now = 0.0
+    monkeypatch.setattr("time.perf_counter", lambda: now)
+    pace = Pace()
+
+    def steps(count, seconds):
+        nonlocal now
+        for _ in range(count):
+            now += seconds
+            pace.step()
+
+    steps(1, 30.0)
+    assert pace.look() == 0.0
+    steps(9, 0.1)
+    assert pace.look() == pytest.approx(0.1)
+    steps(10, 0.2)
+    assert pace.look() == pytest.approx(0.11)
+    now += 5.0
+    pace.pause(5.0)
+    steps(10, 0.11)
+    assert pace.look() == pytest.approx(0.11)
+    steps(10, 0.02)
+    assert pace.look() == pytest.approx(0.02)

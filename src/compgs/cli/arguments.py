@@ -1,24 +1,35 @@
-"""From the words of a command line to a command; what cannot be understood is said in a line or two of our own."""
+"""From the words of a command line to a command; what cannot be understood is said in a line or two of our own.
+
+The parser library draws its complaints for a terminal. None of them is shown or read: values of which a number or a
+choice is expected are all accepted by the parser, and refused here; for words that do not fit together we look
+ourselves at what is missing (`options.py`).
+"""
 
 import contextlib
 import difflib
 import io
-import itertools
 import types
 import typing
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from compgs.cli.command import Command
+from compgs.cli.options import Option, misfit, options_of
 from compgs.cli.settings import parse_value
 from compgs.cli.usage import UsageError
 
 METAVARS = {int: "INT", float: "FLOAT"}
-# What the parser draws around its complaints and between their paragraphs, depending on terminal and version.
-FRAME, RULE = "╭╮╰╯│┌┐└┘├┤─━ |", "─━- "
+
+
+@dataclass(frozen=True)
+class Refused:
+    """In place of a value that could not be understood, until the name of its option is known."""
+
+    complaint: str
 
 
 def parse_command(commands: Sequence[type[Command]], words: Sequence[str]) -> Command:
@@ -29,9 +40,9 @@ def parse_command(commands: Sequence[type[Command]], words: Sequence[str]) -> Co
             f"{words[0]}: there is no such command{_meant(words[0], names)}; there are {', '.join(names)}"
         )
     kind = commands[names.index(words[0])]
-    complaint = io.StringIO()
+    options = options_of(kind)
     try:
-        with contextlib.redirect_stderr(complaint), _values():
+        with contextlib.redirect_stderr(io.StringIO()), _values():
             form: Any = typing.Annotated[kind, tyro.conf.configure(tyro.conf.OmitArgPrefixes)]
             command, unknown = tyro.cli(
                 form,
@@ -42,19 +53,28 @@ def parse_command(commands: Sequence[type[Command]], words: Sequence[str]) -> Co
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise UsageError(f"{_first_paragraph(complaint.getvalue())}\n{_help_line(words[0])}") from None
+        raise UsageError(f"{misfit(options, words[1:])}\n{_help_line(words[0])}") from None
     if unknown:
-        options = [f"--{name.replace('_', '-')}" for name in kind.__dataclass_fields__]
+        flags = [flag for option in options for flag in option.flags]
         raise UsageError(
-            f"{unknown[0]}: compgs {words[0]} has no use for it{_meant(unknown[0], options)}\n"
+            f"{unknown[0]}: compgs {words[0]} has no use for it{_meant(unknown[0], flags)}\n"
             f"{_help_line(words[0])}"
         )
+    _check_values(command, options, words)
     return command
 
 
 def command_name(command: type[Command]) -> str:
     """`DemoScene` is `demo-scene`."""
     return "".join(f"-{c.lower()}" if c.isupper() else c for c in command.__name__).lstrip("-")
+
+
+def _check_values(command: Command, options: Sequence[Option], words: Sequence[str]) -> None:
+    """Raises UsageError for the first value that could not be understood."""
+    for option in options:
+        value = getattr(command, option.field)
+        if isinstance(value, Refused):
+            raise UsageError(f"{option.as_typed(words)}: {value.complaint}\n{_help_line(words[0])}")
 
 
 def _values() -> ConstructorRegistry:
@@ -76,12 +96,20 @@ def _values() -> ConstructorRegistry:
         return PrimitiveConstructorSpec(
             nargs=count,
             metavar=metavar,
-            instance_from_str=lambda texts: parse_value(kind, ",".join(texts)),
+            instance_from_str=lambda texts: _value(kind, texts),
             is_instance=lambda value: True,  # asked only within unions, which are taken whole here
             str_from_instance=lambda value: list(map(str, value if isinstance(value, tuple) else [value])),
         )
 
     return registry
+
+
+def _value(kind: Any, texts: Sequence[str]) -> Any:
+    """Of the type `kind`, or `Refused`: to raise here would leave the message to the parser."""
+    try:
+        return parse_value(kind, ",".join(texts))
+    except ValueError as error:
+        return Refused(str(error))
 
 
 def _without_none(kind: Any) -> Any:
@@ -95,17 +123,6 @@ def _without_none(kind: Any) -> Any:
 def _meant(word: str, known: Sequence[str]) -> str:
     close = difflib.get_close_matches(word, known, n=1)
     return f" (did you mean {close[0]}?)" if close else ""
-
-
-def _first_paragraph(complaint: str) -> str:
-    """The parser's message in one line, without the heading and the frame around it, or the help below it."""
-    lines = [line.strip(FRAME) for line in complaint.strip().splitlines()]
-    paragraphs = [
-        " ".join(group)
-        for is_rule, group in itertools.groupby(lines, key=lambda line: not line.strip(RULE))
-        if not is_rule
-    ]
-    return "".join(paragraphs[1:2] or paragraphs[:1]).removeprefix("Error parsing ")
 
 
 def _help_line(name: str) -> str:

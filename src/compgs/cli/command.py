@@ -128,6 +128,13 @@ def use_threads(count: int) -> None:
     torch.set_num_threads(count)
 
 
+def check_lpips() -> None:
+    """Raises MissingDependency, with the remedy, where LPIPS cannot be measured."""
+    from compgs.metrics import lpips_network
+
+    lpips_network("vgg")
+
+
 def check_device(name: str) -> None:
     """Raises UsageError for a device that PyTorch does not know or does not find."""
     import torch

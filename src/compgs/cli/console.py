@@ -1,5 +1,7 @@
 """What people read: the console, tables, sizes and times."""
 
+import io
+import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -13,6 +15,13 @@ if TYPE_CHECKING:
 
 console = Console(highlight=False, soft_wrap=True)
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def show_whatever_can_be_shown() -> None:
+    """Characters that the terminal or file cannot take, or that are none (in names of files), appear as `\\udce9`."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def say(message: str) -> None:

@@ -1,5 +1,6 @@
 """`compgs demo-scene`: a scene to try the program on."""
 
+import secrets
 import shutil
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -55,9 +56,8 @@ class DemoScene(Command):
 
         # An earlier scene stays until the new one is complete.
         earlier = self.folder.is_dir() and any(self.folder.iterdir())
-        target = self.folder.with_name(f".{self.folder.name}.new") if earlier else self.folder
-        if earlier:
-            shutil.rmtree(target, ignore_errors=True)
+        hidden = self.folder.absolute().with_name(f".{self.folder.absolute().name}.{secrets.token_hex(8)}")
+        target = hidden.with_suffix(".new") if earlier else self.folder
         with counting("ray tracing") as progress:
             generate_scene(
                 target,
@@ -68,8 +68,9 @@ class DemoScene(Command):
                 progress=progress,
             )
         if earlier:
-            shutil.rmtree(self.folder)
+            self.folder.rename(hidden)
             target.rename(self.folder)
+            shutil.rmtree(hidden)
         say(f"{self.folder}: {self.views} views, {self.width} x {self.height}, in COLMAP's layout")
 
 

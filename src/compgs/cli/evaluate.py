@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions, check_lpips
 from compgs.cli.console import print_results, say
 from compgs.cli.inputs import check_scene_file
 from compgs.cli.progress import counting
@@ -39,7 +39,7 @@ class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
     """Replace an evaluation that is in FOLDER already."""
 
     lpips: FlagCreatePairsOff[bool] = False
-    """Also measure LPIPS (needs `pip install 'compgs[lpips]'`)."""
+    """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
 
     def run(self) -> None:
         check_scene_file(self.file)
@@ -47,6 +47,8 @@ class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
             check_output_folder(self.output, overwrite=self.overwrite)
         source = self.scene_source()
         self.prepare()
+        if self.lpips:
+            check_lpips()
         from compgs.evaluation import evaluate
 
         scene = read_scene(source)

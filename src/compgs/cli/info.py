@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 from compgs.cli.command import Command, FileArgument
 from compgs.cli.console import console, print_components, say, size
-from compgs.cli.inputs import read_bitstream
-from compgs.errors import BitstreamError
+from compgs.cli.inputs import named, read_bitstream
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,10 +20,8 @@ class Info(Command, FileArgument):
         data = read_bitstream(self.file)
         from compgs.codec.reader import file_info
 
-        try:
+        with named(self.file):
             info = file_info(data)
-        except BitstreamError as error:
-            raise type(error)(f"{self.file}: {error}") from error
         say(f"{self.file}: {size(len(data))} ({len(data):,} bytes), format version {info.version}")
         say(f"{info.anchors:,} anchors, {info.coupled:,} coupled primitives")
         console.print()

@@ -1,8 +1,10 @@
 """Files that a command reads."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from compgs.errors import BitstreamError, NotACompGSFile
+from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile, TruncatedSection
 
 
 def check_bitstream(path: Path) -> None:
@@ -10,8 +12,17 @@ def check_bitstream(path: Path) -> None:
     data = read_bitstream(path)
     from compgs.codec.format import unpack
 
-    try:
+    with named(path):
         unpack(data)
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """A BitstreamError inside becomes one that names the file, and what to do about it."""
+    try:
+        yield
+    except (TruncatedSection, CorruptSection) as error:
+        raise type(error)(f"{path}: {error}; download or copy the file again") from error
     except BitstreamError as error:
         raise type(error)(f"{path}: {error}") from error
 
@@ -39,6 +50,12 @@ def read_bitstream(path: Path) -> bytes:
             f"{path}: expected a .cgs file; .ply files can be rendered and evaluated, no more"
         )
     try:
-        return path.read_bytes()
+        data = path.read_bytes()
     except OSError as error:
         raise NotACompGSFile(f"{path}: cannot be read ({error.strerror})") from error
+    from compgs.codec.format import MAGIC
+
+    if not data.startswith(MAGIC):
+        found = "is empty" if not data else "is not a .cgs file"
+        raise NotACompGSFile(f"{path}: {found}")
+    return data

@@ -1,7 +1,7 @@
 """`compgs`: dispatch to a command; errors become one clear message and an exit code.
 
 Exit codes: 0 done; 1 something is wrong with the input, the output or the file; 2 the command line could not be
-understood, or has a value that is out of range; 130 stopped by the user.
+understood, or has a value that is out of range; 130 stopped by the user (Ctrl-C), 143 by the system (SIGTERM).
 """
 
 import sys
@@ -13,7 +13,7 @@ from rich.table import Table
 from compgs import __version__
 from compgs.cli.arguments import command_name, parse_command
 from compgs.cli.command import Command
-from compgs.cli.console import console, errors
+from compgs.cli.console import console, errors, show_whatever_can_be_shown
 from compgs.cli.decode import Decode
 from compgs.cli.demo_scene import DemoScene
 from compgs.cli.encode import Encode
@@ -21,8 +21,9 @@ from compgs.cli.evaluate import Evaluate
 from compgs.cli.info import Info
 from compgs.cli.render import Render
 from compgs.cli.train import Train
-from compgs.cli.usage import UsageError
+from compgs.cli.usage import UsageError, in_words_of_options
 from compgs.errors import CompGSError
+from compgs.interrupt import Terminated, ended_on_request, held_back
 
 COMMANDS: tuple[type[Command], ...] = (Train, Encode, Decode, Render, Evaluate, Info, DemoScene)
 
@@ -52,6 +53,7 @@ def parse(words: Sequence[str]) -> Command:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    show_whatever_can_be_shown()
     if given in (["--version"], ["-V"]):
         print(f"compgs {__version__}")
         return 0
@@ -70,14 +72,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(command: Command) -> int:
     """The exit code; unexpected exceptions, which are our mistakes, keep their traceback."""
     try:
-        command.run()
+        with ended_on_request():
+            command.run()
     except (CompGSError, OSError, MemoryError) as error:
         if command.debug:
             raise
         return fail(error)
     except KeyboardInterrupt as stop:
-        errors.print(escape(str(stop) or "interrupted"))
-        return 130
+        with held_back():
+            errors.print(escape(str(stop) or "interrupted"))
+        return 143 if isinstance(stop, Terminated) else 130
     return 0
 
 
@@ -94,7 +98,7 @@ def explain(error: Exception) -> str:
     if isinstance(error, OSError):
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{error.strerror or error}"
-    return str(error)
+    return in_words_of_options(str(error))
 
 
 if __name__ == "__main__":

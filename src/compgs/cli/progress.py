@@ -10,7 +10,6 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     TextColumn,
-    TimeElapsedColumn,
     TimeRemainingColumn,
 )
 
@@ -20,6 +19,8 @@ if TYPE_CHECKING:
     from compgs.training import TrainingStatus
 
 LINE_SECONDS = 15.0  # between two plain lines
+BAR_WIDTH = 12  # columns of the bar beside the words of a training
+COMPILING = "compiling; the first step takes longer than all others"
 
 
 @contextmanager
@@ -36,43 +37,45 @@ def counting(what: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def training() -> Iterator[Callable[["TrainingStatus"], None]]:
-    """Yields `on_progress(status)`: rate, loss, quality, primitives, estimated size and time left."""
+    """Yields `on_progress(status)`: steps, time left, quality, size, and as much else as there is room for."""
     if not console.is_terminal:
+        say(f"training: {COMPILING}")
         yield _training_lines()
         return
-    columns = (
-        TextColumn("training"),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TextColumn("{task.description}"),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[left]}"),
-    )
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=BAR_WIDTH))
     with Progress(*columns, console=console) as bars:
-        task = bars.add_task(
-            "the first steps take longer: kernels are loaded or compiled", total=None, left=""
-        )
+        task = bars.add_task(f"training: {COMPILING}", total=None)
 
         def show(status: "TrainingStatus") -> None:
-            bars.update(
-                task,
-                completed=status.step,
-                total=status.steps,
-                description=describe(status),
-                left=time_left(status),
-            )
+            room = console.width - BAR_WIDTH - 1
+            bars.update(task, completed=status.step, total=status.steps, description=fitting(status, room))
 
         yield show
 
 
-def describe(status: "TrainingStatus") -> str:
-    """`12.3 steps/s  loss 0.0512  PSNR 27.9 dB  4,211 anchors  ~181.0 kB  lambda 0.001`."""
+def parts_of(status: "TrainingStatus") -> list[str]:
+    """What there is to say, what matters most first."""
     rate = 1 / status.seconds_per_step if status.seconds_per_step > 0 else 0.0
-    rate_weight = f"  lambda {status.lmbda:.2g}" if status.lmbda is not None else ""
-    return (
-        f"{rate:.1f} steps/s  loss {status.loss:.4f}  PSNR {status.psnr:.1f} dB  {status.primitives:,} {status.kind}  "
-        f"~{size(status.estimated_bytes)}{rate_weight}"
-    )
+    return [
+        f"step {status.step:,} of {status.steps:,}",
+        time_left(status),
+        f"PSNR {status.psnr:.1f} dB",
+        f"~{size(status.estimated_bytes)}",
+        f"{status.primitives:,} {status.kind}",
+        f"{rate:.1f} steps/s",
+        f"loss {status.loss:.4f}",
+        *([f"lambda {status.lmbda:.2g}"] if status.lmbda is not None else []),
+    ]
+
+
+def fitting(status: "TrainingStatus", room: int) -> str:
+    """As many of the parts, from the first on, as there is room for: in columns of a terminal."""
+    shown, *others = parts_of(status)
+    for part in others:
+        if len(shown) + 2 + len(part) > room:
+            break
+        shown += f"  {part}"
+    return shown
 
 
 def time_left(status: "TrainingStatus") -> str:
@@ -101,7 +104,7 @@ def _training_lines() -> Callable[["TrainingStatus"], None]:
         nonlocal last
         now = time.monotonic()
         if status.step == status.steps or now - last >= LINE_SECONDS:
-            say(f"training: step {status.step} of {status.steps}  {describe(status)}  {time_left(status)}")
+            say(f"training: {'  '.join(parts_of(status))}")
             last = now
 
     return show

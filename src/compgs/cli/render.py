@@ -67,7 +67,7 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
     height: Annotated[int, arg(metavar="PIXELS")] = 480
     """Of the circle's images."""
 
-    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    up: Annotated[tuple[float, float, float], arg(metavar="X Y Z")] = (0.0, -1.0, 0.0)
     """Direction of the sky, for the circle."""
 
     elevation: Annotated[float, arg(metavar="DEGREES")] = 25.0

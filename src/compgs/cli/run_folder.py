@@ -10,7 +10,7 @@ from typing import Any
 from compgs import __version__
 from compgs.cli.methods import METHODS
 from compgs.config import Config, config_from_dict
-from compgs.errors import CheckpointError
+from compgs.errors import CheckpointError, OutputError
 from compgs.outputs import write_json
 
 SETTINGS_NAME = "config.json"
@@ -57,19 +57,44 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
     write_json(folder / SETTINGS_NAME, content)
 
 
-@contextmanager
-def beginning(folder: Path, settings: RunSettings) -> Iterator[None]:
-    """A run begins: its settings are there before its first checkpoint is. If it fails without one, nothing stays.
+class EarlierRun:
+    """What is in a run's folder already. All of it stays until the new run has a checkpoint of its own."""
 
-    A run that has a checkpoint has begun before. Raises OutputError.
+    def __init__(self, folder: Path, settings: RunSettings) -> None:
+        self.folder = folder
+        self.settings = settings  # of the new run
+        self.replaced = False
+        self._checkpoint = _identity(folder / CHECKPOINT_NAME)
+
+    def look(self) -> None:
+        """Give way to the new run if its first checkpoint is there. Raises OutputError."""
+        if not self.replaced and _identity(self.folder / CHECKPOINT_NAME) != self._checkpoint:
+            save_settings(self.folder, self.settings)
+            forget_results(self.folder)
+            self.replaced = True
+
+
+@contextmanager
+def beginning(folder: Path, settings: RunSettings, *, anew: bool = True) -> Iterator[EarlierRun | None]:
+    """A run begins (`anew`) or goes on. Yields the earlier run that it takes the place of, if there is one.
+
+    Else the run's settings are there before its first checkpoint is, and if it fails without one, nothing stays.
+    Raises OutputError.
     """
+    if anew and any(path.exists() for path in _made_by_runs(folder)):
+        earlier = EarlierRun(folder, settings)
+        try:
+            yield earlier
+        finally:
+            earlier.look()
+        return
     if (folder / CHECKPOINT_NAME).exists():
-        yield
+        yield None
         return
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     save_settings(folder, settings)
     try:
-        yield
+        yield None
     except BaseException:
         if not (folder / CHECKPOINT_NAME).exists():
             with suppress(OSError):
@@ -77,6 +102,30 @@ def beginning(folder: Path, settings: RunSettings) -> Iterator[None]:
                 for path in made:
                     path.rmdir()
         raise
+
+
+def forget_results(folder: Path) -> None:
+    """Remove what an earlier run made of its checkpoint: it would be taken for the new run's. Raises OutputError."""
+    for path in _made_by_runs(folder)[1:]:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be replaced ({error.strerror})") from error
+
+
+def _made_by_runs(folder: Path) -> list[Path]:
+    """The checkpoint, and what is made of it in the end."""
+    names = [CHECKPOINT_NAME, TRAINING_NAME, "results.json", "per_view.json"]
+    return [folder / name for name in names + [file_name(folder, m.extension) for m in METHODS.values()]]
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Of a file's present content; none if there is no file. Files here are replaced, never changed."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_ino, found.st_mtime_ns
 
 
 def load_settings(folder: Path) -> RunSettings:
@@ -91,6 +140,11 @@ def load_settings(folder: Path) -> RunSettings:
             method=_known_method(content.get("method", "compgs")),
         )
     except FileNotFoundError as error:
+        if (folder / CHECKPOINT_NAME).is_file():
+            raise CheckpointError(
+                f"{path}: not found, so it is not known how the scene was read; a run that began in Python goes on "
+                f"there, by compgs.train with the same scene and settings, output and resume"
+            ) from error
         raise CheckpointError(
             f"{path}: not found; {folder} is not a run that `compgs train` began"
         ) from error

@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, one_scene
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, check_lpips, one_scene
 from compgs.cli.console import duration, print_profile, print_results, say, size
 from compgs.cli.methods import METHODS, check_settings_of
 from compgs.cli.progress import counting, training
 from compgs.cli.run_folder import (
     CHECKPOINT_NAME,
     TRAINING_NAME,
+    EarlierRun,
     RunSettings,
+    SceneSource,
     beginning,
     file_name,
     load_settings,
@@ -26,7 +28,6 @@ from compgs.cli.settings import with_settings
 from compgs.cli.sizes import parse_size
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.config import load_config
-from compgs.errors import OutputError
 from compgs.outputs import check_output_folder, write_json
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 NEEDED_BYTES = (
     64 << 20
 )  # checkpoint, file and renders of a small scene; a large one fails later, but loses nothing
+BEGINS_AGAIN = "was stopped before its first checkpoint and begins again"
 NOTABLE_MISS = 0.05  # of the size that was asked for
 
 
@@ -109,7 +111,7 @@ class Train(ComputingCommand, SceneOptions):
     """Print where a step's time goes; training.json has it too."""
 
     lpips: FlagCreatePairsOff[bool] = False
-    """Also measure LPIPS (needs `pip install 'compgs[lpips]'`)."""
+    """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
 
     def run(self) -> None:
         if self.output is None:
@@ -122,13 +124,13 @@ class Train(ComputingCommand, SceneOptions):
         check_output_folder(folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES)
         settings = self.settings(folder)
         self.prepare()
+        if self.lpips:
+            check_lpips()
+        if self.resume:
+            say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
         scene = read_scene(settings.scene)
-        if self.resume and not self.continues(folder):
-            say("the run was stopped before its first checkpoint: it begins again, with the same settings")
-        if not self.resume:
-            forget_earlier_run(folder)
-        with beginning(folder, settings):
-            model = self.train(scene, settings, folder)
+        with beginning(folder, settings, anew=not self.resume) as earlier:
+            model = self.train(scene, settings, folder, earlier)
         path = folder / file_name(folder, METHODS[settings.method].extension)
         start = time.perf_counter()
         written = METHODS[settings.method].write(model, path)
@@ -159,12 +161,23 @@ class Train(ComputingCommand, SceneOptions):
             raise UsageError(f"--method {self.method}: the run to continue began with {begun.method}")
         if self.preset not in (None, begun.preset):
             raise UsageError(f"--preset {self.preset}: the run to continue began with preset {begun.preset}")
+        self.check_same_reading(begun.scene)
         changed = with_settings(begun.config, self.assignments())
         if changed != begun.config:
             raise UsageError(
                 "--resume continues with the settings the run began with; other ones need a new run"
             )
         return begun
+
+    def check_same_reading(self, begun: SceneSource) -> None:
+        """Raises UsageError for an option by which the scene would be read otherwise than when the run began."""
+        for name in ("downscale", "images", "test_every", "background"):
+            given, then = getattr(self, name), getattr(begun, name)
+            if given not in (then, getattr(Train, name)):
+                option = f"--{name.replace('_', '-')}"
+                raise UsageError(f"{option} {given}: the run to continue began with {then}; leave it out")
+        if begun.holdout and not self.eval:
+            raise UsageError("--no-eval: the run to continue holds views out; leave it out")
 
     def assignments(self) -> tuple[str, ...]:
         """Options that are settings, as `section.key=value`."""
@@ -176,7 +189,7 @@ class Train(ComputingCommand, SceneOptions):
         }
         return (*(f"{name}={value}" for name, value in named.items() if value is not None), *self.set)
 
-    def train(self, scene: "Scene", settings: RunSettings, folder: Path) -> Any:
+    def train(self, scene: "Scene", settings: RunSettings, folder: Path, earlier: EarlierRun | None) -> Any:
         """The method's model. Raises KeyboardInterrupt, with what to do next, when the user stops it."""
         from compgs.training import StepProfile
 
@@ -190,6 +203,8 @@ class Train(ComputingCommand, SceneOptions):
                 def on_progress(status: "TrainingStatus") -> None:
                     nonlocal last
                     last = status
+                    if earlier is not None:
+                        earlier.look()
                     show(status)
 
                 model = METHODS[settings.method].train(
@@ -201,8 +216,10 @@ class Train(ComputingCommand, SceneOptions):
                     device=self.device,
                     profile=profile,
                 )
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(interrupted(folder)) from None
+        except KeyboardInterrupt as stop:
+            if earlier is not None:
+                earlier.look()
+            raise type(stop)(interrupted(folder, earlier)) from None
         seconds = time.perf_counter() - start
         if last is not None:
             write_json(
@@ -255,7 +272,13 @@ def say_miss(folder: Path, target: int) -> None:
     facts = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     write_json(path, {**facts, "target_bytes": target, "bytes": written, "miss": miss})
     if abs(miss) > NOTABLE_MISS:
-        lmbda = f"lambda ended at {facts['lmbda']:.3g}, within 1e-05 to 1" if "lmbda" in facts else "lambda"
+        from compgs.training.rate_control import HIGHEST, LOWEST
+
+        lmbda = (
+            f"lambda ended at {facts['lmbda']:.3g}, within {LOWEST:g} to {HIGHEST:g}"
+            if "lmbda" in facts
+            else "lambda"
+        )
         way = "fewer anchors (model.voxel_spacings)" if miss > 0 else "more anchors (model.voxel_spacings)"
         say(
             f"note: {size(written)} is what these settings reached ({lmbda}); more --steps let it settle, "
@@ -263,19 +286,19 @@ def say_miss(folder: Path, target: int) -> None:
         )
 
 
-def forget_earlier_run(folder: Path) -> None:
-    """Remove what would be taken for the new run's, were the new run to stop early."""
-    stale = [folder / name for name in (CHECKPOINT_NAME, TRAINING_NAME, "results.json", "per_view.json")]
-    for path in [*stale, *(folder / file_name(folder, m.extension) for m in METHODS.values())]:
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be replaced ({error.strerror})") from error
+def in_words(settings: RunSettings) -> str:
+    """What is trained, and how the scene is read."""
+    scene = settings.scene
+    reading = [f"images at 1/{scene.downscale} of their size"] if scene.downscale != 1 else []
+    reading += [] if scene.holdout else ["no views held out"]
+    return ", ".join([scene.path, *reading, f"method {settings.method}", f"preset {settings.preset}"])
 
 
-def interrupted(folder: Path) -> str:
+def interrupted(folder: Path, earlier: EarlierRun | None = None) -> str:
     """What to tell someone who stopped a training."""
     checkpoint = folder / CHECKPOINT_NAME
+    if earlier is not None and not earlier.replaced:
+        return f"interrupted before the first checkpoint: the earlier run in {folder} is as it was"
     if not checkpoint.is_file():
         return "interrupted before the first checkpoint: nothing was kept"
     command = f"compgs train -o {shlex.quote(str(folder))} --resume"

@@ -14,6 +14,10 @@ OPTIONS = {
 }
 
 
+# What messages tell those to give who call from Python, and what is meant by it here.
+OF_PYTHON = {"overwrite=True": "--overwrite", "resume=True": "--resume", "images=...": "--images"}
+
+
 class UsageError(ConfigError):
     """The command line cannot be understood as it stands, or asks for a value that is out of range."""
 
@@ -24,6 +28,15 @@ def check_range(option: str, value: float, low: float, high: float) -> None:
         raise UsageError(f"{option} {value}: expected {low} to {high}")
 
 
+def in_words_of_options(message: str) -> str:
+    """The message of an error for somebody who gives options, not arguments of functions."""
+    for argument, option in OF_PYTHON.items():
+        message = message.replace(argument, option)
+    for setting, option in OPTIONS.items():
+        message = message.replace(f"{setting} = ", f"{option} ")
+    return message
+
+
 @contextmanager
 def settings_of_options() -> Iterator[None]:
     """A ConfigError of a setting that was given on the command line becomes a UsageError of the option."""
@@ -32,10 +45,10 @@ def settings_of_options() -> Iterator[None]:
     except UsageError:
         raise
     except ConfigError as error:
-        raise UsageError(_in_words_of_options(str(error))) from error
+        raise UsageError(_of_an_option(str(error))) from error
 
 
-def _in_words_of_options(message: str) -> str:
+def _of_an_option(message: str) -> str:
     """`training.steps = 0: ...` is `--steps 0: ...`; where there is no such option, `--set training.steps=0: ...`."""
     name, _, rest = message.partition(" ")
     rest = rest.removeprefix("= ")

@@ -27,10 +27,10 @@ def contact_sheet(
     height = label + sum(label + left.height for left, _ in pairs) + MARGIN
     sheet = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(sheet)
-    draw.text((MARGIN, MARGIN), title, fill=INK, font=font)
+    draw.text((MARGIN, MARGIN), _drawable(title), fill=INK, font=font)
     top = label
     for (left, right), (_, _, name, psnr) in zip(pairs, rows, strict=True):
-        draw.text((MARGIN, top + MARGIN), f"{name}: photograph", fill=INK, font=font)
+        draw.text((MARGIN, top + MARGIN), _drawable(f"{name}: photograph"), fill=INK, font=font)
         draw.text(
             (column + 2 * MARGIN, top + MARGIN), f"decoded file, PSNR {psnr:.2f} dB", fill=INK, font=font
         )
@@ -39,6 +39,11 @@ def contact_sheet(
         sheet.paste(right, (column + 2 * MARGIN, top))
         top += left.height
     return np.asarray(sheet)
+
+
+def _drawable(text: str) -> str:
+    """Names of files need not be text; what is drawn must be."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def _reduced(image: np.ndarray) -> Image.Image:

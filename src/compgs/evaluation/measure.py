@@ -21,6 +21,7 @@ from compgs.evaluation.scene_file import SceneModel, component_bytes, open_scene
 from compgs.model.splats import SplatModel
 from compgs.outputs import check_output_folder, write_bytes, write_json
 from compgs.render import render
+from compgs.scene import as_scene
 from compgs.scene.views import Scene, View
 
 SHEET_ROWS = 4  # views on the contact sheet
@@ -28,7 +29,7 @@ SHEET_ROWS = 4  # views on the contact sheet
 
 def evaluate(
     file: str | Path,
-    scene: Scene,
+    scene: Scene | str | Path,
     *,
     output: str | Path | None = None,
     overwrite: bool = False,
@@ -38,14 +39,14 @@ def evaluate(
 ) -> Results:
     """Decode a .cgs file, or read a .ply file of splats, and compare its renderings with a scene's held-out views.
 
-    Metrics are of 8-bit images (`compgs.metrics`). With `output`, a folder, `results.json` and
-    `per_view.json` (their schema: `compgs.evaluation.results`), `cameras.json` (of the held-out views),
-    `test/renders`, `test/gt` and `contact_sheet.png` are written there. `progress(done, total)` is called
-    after each view.
+    Metrics are of 8-bit images (`compgs.metrics`). A scene that is given as a folder is read as `load_scene(folder)`
+    does. With `output`, a folder, `results.json` and `per_view.json` (their schema: `compgs.evaluation.results`),
+    `cameras.json` (of the held-out views), `test/renders`, `test/gt` and `contact_sheet.png` are written there.
+    `progress(done, total)` is called after each view.
 
     Raises BitstreamError, SplatFileError, SceneError if the scene holds no view out, OutputError.
     """
-    path = Path(file)
+    path, scene = Path(file), as_scene(scene)
     if output is not None:
         check_output_folder(Path(output), overwrite=overwrite)
     if not scene.test_views:

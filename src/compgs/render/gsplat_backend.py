@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from compgs.cameras import Camera
-from compgs.errors import ConfigError, MissingDependency
+from compgs.errors import ConfigError, MissingDependency, install_line
 from compgs.gaussians import Gaussians
 from compgs.render.result import RasterResult
 from compgs.render.settings import DEFAULT_SETTINGS, RasterSettings
@@ -93,7 +93,7 @@ def load_gsplat() -> ModuleType:
         import gsplat
     except ImportError as error:
         raise MissingDependency(
-            f"rendering on CUDA needs gsplat ({error}); install it with: pip install 'compgs[cuda]'"
+            f"rendering on CUDA needs gsplat ({error}); {install_line('cuda')}"
         ) from error
     return gsplat
 

@@ -1,11 +1,12 @@
 """The public face of rendering: a decoded or trained scene, seen from a camera."""
 
 import functools
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
 from compgs.cameras import Camera
+from compgs.errors import ConfigError
 from compgs.gaussians import Gaussians
 from compgs.render.rasterize import rasterize, rasterize_parts
 from compgs.render.result import RasterResult
@@ -13,6 +14,7 @@ from compgs.render.settings import RasterSettings
 from compgs.render.visibility import visible_mask
 
 
+@runtime_checkable
 class Renderable(Protocol):
     """Anything that says which Gaussians a camera sees.
 
@@ -38,9 +40,28 @@ def _moved(camera: Camera, offset: tuple[float, float, float]) -> Camera:
     return camera.moved(offset)
 
 
+@runtime_checkable
+class Trained(Protocol):
+    """What training gives: it can be rendered as what a decoder would make of it."""
+
+    def as_hybrid_model(self) -> Renderable: ...
+
+
 @torch.no_grad()
-def render(model: Renderable, camera: Camera, settings: RasterSettings | None = None) -> RasterResult:
-    """One view of a scene, without gradients, from a camera of the world. By default over the model's background."""
+def render(
+    model: Renderable | Trained, camera: Camera, settings: RasterSettings | None = None
+) -> RasterResult:
+    """One view of a scene, without gradients, from a camera of the world. By default over the model's own background.
+
+    A trained model is quantized anew for each view; for many views, render its `as_hybrid_model()`. Raises ConfigError
+    for what is no model.
+    """
+    if isinstance(model, Trained):
+        model = model.as_hybrid_model()
+    if not isinstance(model, Renderable):
+        raise ConfigError(
+            f"model: expected what compgs.train or compgs.decode gives, found {type(model).__name__}"
+        )
     camera = local_camera(model, camera)
     settings = settings or RasterSettings(background=model.background)
     bounds = getattr(model, "bounds", None)

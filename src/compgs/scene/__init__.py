@@ -9,7 +9,7 @@ import numpy as np
 
 from compgs.errors import ConfigError, MissingSparseModel, SceneError
 from compgs.scene.blender import read_blender
-from compgs.scene.capture import Capture, PosedImage
+from compgs.scene.capture import Capture, PosedImage, check_inside
 from compgs.scene.colmap import find_sparse_model
 from compgs.scene.colmap_capture import read_colmap
 from compgs.scene.images import Progress, image_size, load_views
@@ -17,7 +17,7 @@ from compgs.scene.nerfstudio import read_nerfstudio
 from compgs.scene.points import MIN_POINTS, fallback_points
 from compgs.scene.views import Points, Scene, View, scene_extent
 
-__all__ = ["Points", "Scene", "View", "load_scene"]
+__all__ = ["Points", "Scene", "View", "as_scene", "load_scene"]
 
 FALLBACK_POINTS = 20_000  # random points of a scene without sparse points
 MAX_DOWNSCALE = 32  # beyond it somebody means a width in pixels
@@ -41,6 +41,8 @@ def load_scene(
     folder = Path(path)
     capture = _read_layout(folder, images)
     _check_views(capture, folder)
+    for posed in capture.images:
+        check_inside(posed.path, (folder, folder / images), f"the image of the view {posed.name!r}")
     capture, downscale = _prescaled(capture, folder, images, downscale)
 
     behind = background or capture.background
@@ -56,6 +58,20 @@ def load_scene(
         extent=_extent(views, points),
         source=folder,
         notes=capture.notes + notes,
+    )
+
+
+def as_scene(scene: Scene | str | Path) -> Scene:
+    """The scene itself, or of a folder what `load_scene` reads by default.
+
+    Raises what `load_scene` raises, and ConfigError for what is neither.
+    """
+    if isinstance(scene, Scene):
+        return scene
+    if isinstance(scene, str | Path):
+        return load_scene(scene)
+    raise ConfigError(
+        f"scene: expected what compgs.load_scene gives, or the folder of a scene, found {type(scene).__name__}"
     )
 
 

@@ -1,12 +1,13 @@
 """What the reader of every layout hands over: where the images lie and how they were taken, no pixels yet."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from compgs.cameras import Camera
-from compgs.errors import UnsupportedCamera
+from compgs.errors import SceneError, UnsupportedCamera
 from compgs.scene.undistort import Distortion
 from compgs.scene.views import Points
 
@@ -39,6 +40,19 @@ class Capture:
 def usable_positions(positions: np.ndarray) -> np.ndarray:  # positions: [P, 3] float64
     """[P] bool: points that have a place, finite also in single precision."""
     return (np.abs(positions) < MAX_COORDINATE).all(axis=1)  # False where not a number
+
+
+def check_inside(path: Path, folders: tuple[Path, ...], what: str) -> None:
+    """Raises SceneError for a path that leads out of the folders: of a scene from elsewhere, nothing else is read.
+
+    Links are followed, as somebody put them there; `..` in names of a scene's files is not. The first folder is the
+    scene's; `what` lies there.
+    """
+    place = Path(os.path.normpath(path.absolute()))
+    if not any(place.is_relative_to(os.path.normpath(folder.absolute())) for folder in folders):
+        raise SceneError(
+            f"{folders[0]}: {what} lies outside of the scene's folder; move it there, and name it relative to that"
+        )
 
 
 def check_camera(camera: Camera, place: str) -> None:

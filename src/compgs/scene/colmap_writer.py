@@ -1,11 +1,11 @@
 """Writes COLMAP sparse models, binary and text: the mirror image of `colmap.py`."""
 
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from compgs.outputs import replacing
 from compgs.scene.colmap import MODEL_IDS, ColmapCamera, ColmapImage, ColmapPoints
 
 
@@ -27,9 +27,8 @@ def write_sparse_model(
         "points3D": _points_text(points, tracks) if text else _points_binary(points, tracks),
     }
     for part, content in contents.items():
-        unfinished = folder / f"{part}.{kind}.part"
-        unfinished.write_bytes(content)
-        os.replace(unfinished, folder / f"{part}.{kind}")
+        with replacing(folder / f"{part}.{kind}") as unfinished:
+            unfinished.write_bytes(content)
 
 
 def point_tracks(images: Iterable[ColmapImage]) -> dict[int, list[tuple[int, int]]]:

@@ -17,6 +17,10 @@ from compgs.scene.capture import PosedImage
 from compgs.scene.undistort import sample_bicubic, undistorted_camera, undistortion_map
 from compgs.scene.views import View
 
+# What photographs are stored as. Pillow would open more by their content, whatever they are called: PostScript, which
+# is a program, and others of which a decoder is an unneeded risk. (MPO: JPEG of cameras that store several images.)
+FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "JPEG2000", "AVIF")
+
 # What Pillow raises for damaged files, besides OSError
 _DAMAGED = (OSError, ValueError, SyntaxError, EOFError, IndexError, MemoryError, Image.DecompressionBombError)
 
@@ -29,7 +33,7 @@ _Result = TypeVar("_Result")
 def image_size(file: Path) -> tuple[int, int]:
     """(width, height) in pixels, from the header alone. Raises UnreadableImage."""
     try:
-        with Image.open(file) as image:
+        with _opened(file) as image:
             return image.size
     except _DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
@@ -77,11 +81,17 @@ def read_image(file: Path, background: tuple[float, float, float]) -> np.ndarray
     The orientation tag is ignored, as structure from motion ignores it: poses belong to the stored pixels.
     """
     try:
-        with Image.open(file) as image:
+        with _opened(file) as image:
             image.load()
             return _rgb(image, background)
     except _DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
+
+
+def _opened(file: Path) -> Image.Image:
+    """Of the formats that this Pillow has."""
+    Image.init()
+    return Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN])
 
 
 def _rgb(image: Image.Image, background: tuple[float, float, float]) -> np.ndarray:
@@ -103,7 +113,7 @@ def _checked_cameras(images: Sequence[PosedImage]) -> list[Camera]:
     if missing:
         raise UnreadableImage(
             f"{missing[0].path}: this view's image does not exist{_more(len(missing) - 1, 'missing')}; "
-            f"put the images there, or name their folder with --images"
+            f"put the images there, or name their folder with images=..."
         )
     sizes = _in_threads(lambda index: image_size(images[index].path), len(images), None)
     wrong = [i for i, posed in enumerate(images) if not fits(sizes[i], posed.camera)]
@@ -173,5 +183,7 @@ def _more(count: int, what: str) -> str:
 
 
 def _reason(file: Path, error: BaseException) -> str:
+    if isinstance(error, Image.DecompressionBombError):
+        return f"{file}: the image is too large ({error}); give smaller copies of all images"
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return f"{file}: the image cannot be read ({reason}); restore it, or remove the view from the poses"

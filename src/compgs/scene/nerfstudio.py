@@ -7,7 +7,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
-from compgs.scene.capture import Capture, PosedImage, check_camera
+from compgs.scene.capture import Capture, PosedImage, check_camera, check_inside
 from compgs.scene.images import image_size
 from compgs.scene.ply_points import read_ply_points
 from compgs.scene.transforms import file_path, number, read_transforms, world_to_camera
@@ -44,6 +44,7 @@ def read_nerfstudio(folder: Path) -> Capture:
 def _points(folder: Path, values: dict[str, Any]) -> Points:
     ply = values.get("ply_file_path")
     if isinstance(ply, str) and (folder / ply).is_file():
+        check_inside(folder / ply, (folder,), f"ply_file_path {ply!r}")
         return read_ply_points(folder / ply)
     return Points(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
 

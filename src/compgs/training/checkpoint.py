@@ -4,7 +4,6 @@ Tensors by name; settings, counters and the view order as JSON in the file's met
 """
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from torch import Tensor, nn
 from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
 from compgs.errors import CheckpointError, OutputError
+from compgs.outputs import replacing
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
 from compgs.training.decorrelation import keep_channels
@@ -64,17 +64,14 @@ def write_checkpoint_file(
 ) -> None:
     """Tensors by name and JSON texts by name, of a method's run. Raises OutputError; see `save_checkpoint`."""
     stamp = {"format": "compgs checkpoint", "version": CHECKPOINT_VERSION, "method": method}
-    temporary = path.with_name(path.name + ".partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        safetensors.torch.save_file(
-            {k: v.detach().cpu().contiguous() for k, v in tensors.items()},
-            temporary,
-            metadata=metadata | stamp,
-        )
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            safetensors.torch.save_file(
+                {k: v.detach().cpu().contiguous() for k, v in tensors.items()},
+                temporary,
+                metadata=metadata | stamp,
+            )
     except (OSError, safetensors.SafetensorError) as error:
-        temporary.unlink(missing_ok=True)
         raise OutputError(f"{path}: the checkpoint cannot be written ({error})") from error
 
 

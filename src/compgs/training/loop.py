@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.config import TrainingConfig
+from compgs.config import Config, TrainingConfig, check_config, load_config
 from compgs.errors import ConfigError, TrainingError
+from compgs.interrupt import held_back
 from compgs.losses import Target
 from compgs.scene.views import View
 from compgs.training.allocation import freed_memory_kept
 from compgs.training.checkpoint import CHECKPOINT_NAME
-from compgs.training.interrupt import held_back
 
 REPORT_EVERY = 10  # steps between two status reports
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it may look at every primitive
@@ -74,6 +74,21 @@ def chosen_device(device: str | torch.device | None) -> torch.device:
     return torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
 
 
+def chosen_config(config: Config | None, preset: str | None) -> Config:
+    """The given one, or a preset's; of neither, the preset `default`. Raises ConfigError for both, or a bad one."""
+    if config is not None and preset is not None:
+        raise ConfigError(
+            f"config and preset={preset!r} were both given: give one; compgs.load_config({preset!r}) is a config"
+        )
+    if config is not None and not isinstance(config, Config):
+        raise ConfigError(
+            f"config: expected what compgs.load_config gives, found {config!r}; a preset is given as preset='quick'"
+        )
+    chosen = config or load_config(preset or "default")
+    check_config(chosen)
+    return chosen
+
+
 def checkpoint_path(output: str | Path | None, *, resume: bool) -> Path | None:
     """In the run's folder, if there is one. Raises ConfigError if there is none to resume from."""
     if output is None and resume:
@@ -102,6 +117,69 @@ def diverged(step: int, what: str, value: float) -> TrainingError:
     return TrainingError(f"step {step}: the {what} is {value}; try a lower learning rate or another seed")
 
 
+class Pace:
+    """Seconds per step, of the last steps; what the first step takes to compile or load kernels does not count."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0  # unknown before the second step
+        self._since: float | None = None
+        self._steps = 0
+
+    def step(self) -> None:
+        """A step is done."""
+        if self._since is None:
+            self._since = time.perf_counter()
+        else:
+            self._steps += 1
+
+    def look(self) -> float:
+        """Smoothed, but not for long: kernels that are compiled later on say nothing of the rest either."""
+        now = time.perf_counter()
+        if self._since is not None and self._steps:
+            recent = (now - self._since) / self._steps
+            steady = self.seconds and recent >= 0.5 * self.seconds
+            self.seconds = 0.9 * self.seconds + 0.1 * recent if steady else recent
+            self._since, self._steps = now, 0
+        return self.seconds
+
+    def pause(self, seconds: float) -> None:
+        """Something else than steps took so long."""
+        if self._since is not None:
+            self._since += seconds
+
+
+class Saving:
+    """A run's checkpoint: written every few minutes, at the end, and when the run is stopped.
+
+    A run that takes the place of an earlier one leaves the earlier checkpoint until it has been going for long enough
+    to write one of its own: whoever stops it at once keeps what there was.
+    """
+
+    def __init__(self, trainer: Trains, path: Path | None, minutes: float) -> None:
+        self.trainer = trainer
+        self.path = path
+        self.seconds = 60 * minutes
+        self.saved = time.perf_counter()
+        self.replaces = path is not None and trainer.step == 0 and path.exists()
+
+    def due(self) -> bool:
+        return self.path is not None and time.perf_counter() - self.saved > self.seconds
+
+    def save(self) -> float:
+        """Seconds that it took. Whoever stops the run meanwhile is heard when the checkpoint is whole."""
+        start = time.perf_counter()
+        if self.path is not None:
+            with held_back():
+                self.trainer.save(self.path)
+        self.saved, self.replaces = time.perf_counter(), False
+        return self.saved - start
+
+    def stopped(self) -> None:
+        """Save, unless an earlier run's checkpoint would be lost."""
+        if not self.replaces:
+            self.save()
+
+
 @freed_memory_kept()
 def run_to_end(
     trainer: Trains,
@@ -109,36 +187,31 @@ def run_to_end(
     path: Path | None,
     on_progress: Callable[[TrainingStatus], None] | None,
 ) -> None:
-    """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
-    saved = reported = time.perf_counter()
-    estimate, pace, counted = 0, 0.0, trainer.step
+    """All remaining steps; checkpoints at `path` as `Saving` says. Progress is reported now and then, and right after
+    each checkpoint."""
+    saving, pace, estimate = Saving(trainer, path, config.checkpoint_minutes), Pace(), 0
     try:
         while trainer.step < config.steps:
             with held_back():
                 result = trainer.train_step()
-            now = time.perf_counter()
-            told = trainer.step % REPORT_EVERY == 0 or trainer.step == config.steps
+            pace.step()
+            saves = saving.due()
+            told = trainer.step % REPORT_EVERY == 0 or trainer.step == config.steps or saves
             # Before anything is computed from what has diverged.
             if told and not torch.isfinite(result.loss):
                 raise diverged(trainer.step, "loss", float(result.loss))
+            if saves:
+                pace.pause(saving.save())
             if on_progress and told:
+                seconds = pace.look()
                 if trainer.step % ESTIMATE_EVERY == 0 or not estimate:
                     estimate = trainer.estimated_bytes()
-                recent = (now - reported) / (trainer.step - counted)
-                # Smoothed, but not for long: the first steps compile kernels and say nothing of the rest.
-                pace = recent if not pace or recent < 0.5 * pace else 0.9 * pace + 0.1 * recent
-                reported, counted = now, trainer.step
-                on_progress(_status(trainer, config.steps, result, estimate, pace))
-            if path and now - saved > 60 * config.checkpoint_minutes:
-                trainer.save(path)
-                saved = now
+                on_progress(_status(trainer, config.steps, result, estimate, seconds))
         trainer.finish()
     except KeyboardInterrupt:
-        if path:
-            trainer.save(path)
+        saving.stopped()
         raise
-    if path:
-        trainer.save(path)
+    saving.save()
 
 
 def _status(trainer: Trains, steps: int, result: StepResult, estimate: int, pace: float) -> TrainingStatus:

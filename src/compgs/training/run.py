@@ -13,5 +13,7 @@ def load_run(folder: str | Path) -> TrainedModel:
     checkpoint = load_checkpoint(path)
     step, steps = checkpoint.state["step"], checkpoint.model.config.training.steps
     if step < steps:
-        raise CheckpointError(f"{path}: the run stopped at step {step} of {steps}; continue it with --resume")
+        raise CheckpointError(
+            f"{path}: the run stopped at step {step} of {steps}; continue it with resume=True"
+        )
     return checkpoint.model

@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from compgs.config import Config, check_config, config_from_dict, load_config
-from compgs.errors import ConfigError, TrainingError
+from compgs.config import Config, config_from_dict
+from compgs.errors import ConfigError
 from compgs.losses import Target, photometric_loss
 from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
 from compgs.render import RasterSettings, rasterize, visible_mask
+from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.training.checkpoint import (
@@ -33,6 +34,7 @@ from compgs.training.loop import (
     StepResult,
     TrainingStatus,
     checkpoint_path,
+    chosen_config,
     chosen_device,
     kept_target,
     next_view,
@@ -40,6 +42,7 @@ from compgs.training.loop import (
 )
 from compgs.training.optimizers import exponential_decay, set_learning_rates
 from compgs.training.profile import NoProfile, StepProfile
+from compgs.training.seen_points import check_points_seen
 from compgs.training.splat_parameters import (
     SplatParameters,
     initial_splats,
@@ -53,10 +56,10 @@ STORED_NUMBERS = 3 + 3 + 3 + 1 + 3 + 4
 
 
 def train_splats(
-    scene: Scene,
+    scene: Scene | str | Path,
     config: Config | None = None,
     *,
-    preset: str = "default",
+    preset: str | None = None,
     output: str | Path | None = None,
     resume: bool = False,
     on_progress: Callable[[TrainingStatus], None] | None = None,
@@ -69,8 +72,8 @@ def train_splats(
 
     Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
     """
-    config = config or load_config(preset)
-    check_config(config)
+    config = chosen_config(config, preset)
+    scene = as_scene(scene)
     chosen = chosen_device(device)
     path = checkpoint_path(output, resume=resume)
     if resume and path:
@@ -183,11 +186,7 @@ class SplatTrainer:
 
     def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
-        bounds = self.parameters.means.detach(), splat_radii(self.parameters.splats())
-        if not any(visible_mask(*bounds, v.camera, self.settings).any() for v in self.scene.train_views):
-            raise TrainingError(
-                f"{self.scene.name}: no view sees any of the scene's points; are the poses right?"
-            )
+        check_points_seen(self.scene, self.settings.near_plane)
         run_to_end(self, self.config.training, path, on_progress)
 
     def estimated_bytes(self) -> int:

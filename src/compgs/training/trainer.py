@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from compgs.cameras import Camera
-from compgs.config import Config, check_config, load_config
+from compgs.config import Config
 from compgs.entropy import Quantized
 from compgs.entropy.network import FRACTION_BITS
 from compgs.entropy.quantization import UniformNoise, weight_exponent
@@ -26,6 +26,7 @@ from compgs.losses import (
 )
 from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
 from compgs.render import RasterSettings, contributions, rasterize, visible_mask
+from compgs.scene import as_scene
 from compgs.scene.views import Scene, View
 from compgs.scene.world import local_scene
 from compgs.trained_model import BIAS_BITS, TrainedModel
@@ -45,6 +46,7 @@ from compgs.training.loop import (
     StepResult,
     TrainingStatus,
     checkpoint_path,
+    chosen_config,
     chosen_device,
     diverged,
     kept_target,
@@ -54,6 +56,7 @@ from compgs.training.loop import (
 from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rates, step_rows
 from compgs.training.profile import NoProfile, StepProfile
 from compgs.training.rate_control import LOOKS, RateState, due, follow
+from compgs.training.seen_points import check_points_seen
 
 # With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
 FEW_DRAWN = 0.1
@@ -63,26 +66,26 @@ SHARES = 10  # looks in a run at how much the last step drops, where the size is
 
 
 def train(
-    scene: Scene,
+    scene: Scene | str | Path,
     config: Config | None = None,
     *,
-    preset: str = "default",
+    preset: str | None = None,
     output: str | Path | None = None,
     resume: bool = False,
     on_progress: Callable[[TrainingStatus], None] | None = None,
     device: str | torch.device | None = None,
     profile: StepProfile | None = None,
 ) -> TrainedModel:
-    """Train a scene; the result is ready for `compgs.encode`.
+    """Train a scene, or the one in a folder; the result is ready for `compgs.encode`.
 
-    With `output`, a folder, checkpoints are written there, also when the run is interrupted; `resume` continues from
-    the last one exactly as if the run had not stopped. `profile` gathers where the time goes. Default device: CUDA
-    where there is one.
+    Settings are those of `config`, or of a preset, `default` if there is neither. With `output`, a folder, checkpoints
+    are written there, also when the run is interrupted; `resume` continues from the last one exactly as if the run had
+    not stopped. `profile` gathers where the time goes. Default device: CUDA where there is one.
 
     Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
     """
-    config = config or load_config(preset)
-    check_config(config)
+    config = chosen_config(config, preset)
+    scene = as_scene(scene)
     chosen = chosen_device(device)
     path = checkpoint_path(output, resume=resume)
     if resume and path:
@@ -299,11 +302,7 @@ class Trainer:
 
     def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
-        if not any(len(self.visible_anchors(view.camera)) for view in self.scene.train_views):
-            raise TrainingError(
-                f"{self.scene.name}: no view sees any of the scene's points from farther than "
-                f"{self.settings.near_plane} world units; are the poses right, and the unit of length?"
-            )
+        check_points_seen(self.scene, self.settings.near_plane)
         run_to_end(self, self.config.training, path, on_progress)
 
     @property

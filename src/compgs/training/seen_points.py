@@ -1,0 +1,52 @@
+"""Whether poses and points fit together: asked before the first step, as a run on others ends in an empty scene."""
+
+import math
+
+import numpy as np
+
+from compgs.cameras import Camera
+from compgs.errors import TrainingError
+from compgs.scene.views import Scene
+
+LOOKED_AT = 10_000  # points, spread over all of them: a share needs no more
+MIN_SEEN = 0.01  # share of the points that some training view must see; of a reconstruction it is nearly all
+MAX_TOO_NEAR = 0.5  # share of what the views see that may be too near to be drawn
+MARGIN = 0.1  # of an image's sides: what is a little outside is drawn into it
+
+
+def check_points_seen(scene: Scene, near_plane: float) -> None:
+    """Raises TrainingError, with the remedy, if hardly any point is in the training views, or most are too near.
+
+    `near_plane`: world units; what is nearer to a camera is not drawn.
+    """
+    positions = scene.points.positions[:: max(1, len(scene.points) // LOOKED_AT)].astype(np.float64)
+    seen = np.zeros(len(positions), dtype=bool)
+    depths = []
+    for view in scene.train_views:
+        depth, inside = depths_in(view.camera, positions)
+        seen |= inside
+        depths.append(depth[inside])
+    if seen.mean() < MIN_SEEN:
+        raise TrainingError(
+            f"{scene.name}: {100 * seen.mean():.1f} % of the scene's points are in any training view; poses and points "
+            "must be of one reconstruction, and poses have x to the right, y down and z forward (COLMAP)"
+        )
+    in_views = np.concatenate(depths)
+    too_near = float((in_views < near_plane).mean())
+    if too_near > MAX_TOO_NEAR:
+        factor = 10.0 ** math.ceil(-math.log10(max(float(np.median(in_views)), 1e-30)))
+        raise TrainingError(
+            f"{scene.name}: {100 * too_near:.0f} % of what the training views see is nearer than {near_plane:g} world "
+            f"units, and would not be drawn; scale camera positions and points up, {factor:g} times"
+        )
+
+
+def depths_in(camera: Camera, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [P] of positions [P, 3] along the camera's axis, world units; [P] bool: which are in its image."""
+    x, y, depth = (positions @ camera.rotation.T + camera.translation).T
+    ahead = depth > 0
+    safe = np.where(ahead, depth, 1.0)
+    column, row = camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy
+    across = (column > -MARGIN * camera.width) & (column < (1 + MARGIN) * camera.width)
+    down = (row > -MARGIN * camera.height) & (row < (1 + MARGIN) * camera.height)
+    return depth, ahead & across & down
