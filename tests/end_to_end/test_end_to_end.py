@@ -111,7 +111,9 @@ def test_symbols_do_not_depend_on_process_or_number_of_threads(run: Path, tmp_pa
     assert main(["decode", str(run / "tiny.cgs"), "-o", str(tmp_path / "all")]) == 0
     with np.load(tmp_path / "one" / "latents.npz") as one, np.load(tmp_path / "all" / "latents.npz") as every:
         assert (
-            set(one) == set(every) == {"positions", "log_scales", "references", "residuals", "anchor_index"}
+            set(one)
+            == set(every)
+            == {"positions", "log_scales", "references", "residuals", "anchor_index", "world_offset"}
         )
         for name in one:
             np.testing.assert_array_equal(one[name], every[name])
