@@ -14,7 +14,8 @@ SOURCE = Path(compgs.__file__).parent
 
 # A part may import itself, and the parts named here.
 BASE = {
-    "compgs", "linear", "vector_sums", "rotations", "errors", "gaussians", "cameras", "config", "interrupt", "outputs", "presets",
+    "compgs", "linear", "vector_sums", "rotations", "errors", "gaussians", "cameras", "config", "interrupt", "outputs",
+    "presets",
 }  # fmt: skip
 ALLOWED = {
     "compgs": {

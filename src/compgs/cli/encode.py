@@ -159,7 +159,9 @@ class Encode(ComputingCommand, ReadingOptions):
         from compgs.evaluation.camera_path import surround
 
         content = read_content(data)
-        cameras = [camera for _, camera in surround(content.coordinates * content.voxel_size)]
+        origin = tuple(-x for x in content.world_offset)
+        around = surround(content.coordinates * content.voxel_size)
+        cameras = [camera.moved(origin) for _, camera in around]
         return cameras, (), f"{len(cameras)} cameras around the scene; --scene judges by photographs"
 
     def scene_source(self) -> SceneSource | None:
