@@ -10,7 +10,8 @@ from compgs.metrics import psnr, to_8bit
 from compgs.render import RasterSettings, rasterize, render
 from compgs.scene.views import View
 from compgs.training import train
-from compgs.training.trainer import Trainer, worth_keeping
+from compgs.training.importance import worth_keeping
+from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
 
