@@ -78,11 +78,11 @@ def write_content(
         Section(HEADS, encode_heads(content.heads)),
     ]
     ranges = _ranges(content, counts, chosen_levels(counts) if levels is None else levels)
+    padding = _padding(content, sections + ranges)
+    if padding:  # before the ranges, so that the beginnings of the file that are scenes are padded, too
+        sections.append(Section(PADDING, bytes(padding)))
     if content.metadata:
         ranges.append(Section(METADATA, encode_metadata(content.metadata)))
-    padding = _padding(content, sections + ranges)
-    if padding:  # before the ranges, so that a beginning of the file is padded, too
-        sections.append(Section(PADDING, bytes(padding)))
     return pack(sections + ranges)
 
 
