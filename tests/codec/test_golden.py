@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[2]
 GOLDEN = ROOT / "tests" / "golden"
 PINNED = json.loads((GOLDEN / "hashes.json").read_text(encoding="utf-8"))
 sys.path.append(str(ROOT / "tools"))
+from describe_file import table  # noqa: E402
 from make_golden_files import contents, hashes, make_content  # noqa: E402
 from plain_decoder import decode  # noqa: E402
 
@@ -107,6 +108,18 @@ def test_the_document_shows_the_tiny_file_byte_by_byte() -> None:
     shown = b""
     for offset, piece in rows:
         assert int(offset) == len(shown)
+        shown += bytes.fromhex(piece)
+    assert shown == data
+
+
+@pytest.mark.parametrize("name", sorted(PINNED))
+def test_every_byte_of_a_golden_file_has_a_meaning(name: str) -> None:
+    data = (GOLDEN / f"{name}.cgs").read_bytes()
+    shown = b""
+    for offset, piece, meaning in re.findall(
+        r"^\| (\d+) \| `([0-9a-f ]+)` \| (.+) \|$", table(data), re.MULTILINE
+    ):
+        assert int(offset) == len(shown) and meaning
         shown += bytes.fromhex(piece)
     assert shown == data
 
