@@ -83,7 +83,7 @@ def make_content(
             spread = np.linspace(0.5, 6.0, shape.channels)
             drawn = np.rint(rng.standard_normal((rows, shape.channels)) * spread * symbols).astype(np.int32)
             prior = hyper_tables(
-                np.full((shape.width(d.coupled_primitives), 49), 1.0 / 49), _by_table(drawn, anchors)
+                np.full((shape.width(d.coupled_primitives), 49), 1.0 / 49), drawn.reshape(anchors, -1)
             )
             latents.append(fixed_point(drawn))
         if shape.role == Role.RESIDUAL:
@@ -104,10 +104,6 @@ def make_content(
         heads=_heads(rng, d),
         metadata={"creator": "made up"},
     )
-
-
-def _by_table(symbols: np.ndarray, anchors: int) -> np.ndarray:
-    return symbols.reshape(anchors, -1)
 
 
 def _draw(rng: np.random.Generator, index: np.ndarray, symbols: bool) -> np.ndarray:
@@ -165,8 +161,10 @@ def _layer(weight: np.ndarray, bias: np.ndarray, *, rectify: bool, adds: bool = 
 
 def _heads(rng: np.random.Generator, d: Dimensions) -> tuple[tuple[str, QuantizedTensor], ...]:
     shapes = {"weight": (d.width, d.reference_dim + d.residual_dim), "bias": (d.width,)}
+    named = {f"{head}.{name}": shape for head in ("geometry", "appearance") for name, shape in shapes.items()}
+    if d.channels(Role.RESIDUAL) == 0:
+        named["residuals"] = (d.coupled_primitives, d.residual_dim)
     return tuple(
-        (f"{head}.{name}", QuantizedTensor(np.rint(rng.laplace(0, 20, shape)).astype(np.int32), 6))
-        for head in ("geometry", "appearance")
-        for name, shape in shapes.items()
+        (name, QuantizedTensor(np.rint(rng.laplace(0, 20, shape)).astype(np.int32), 6))
+        for name, shape in named.items()
     )

@@ -13,10 +13,10 @@ from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.entropy.models import EntropyModel, Quantized, starting_residuals
 from compgs.entropy.quantization import quantize_weight
-from compgs.linear import Reader
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.prediction import PredictionHeads
 from compgs.model.primitives import Primitives, every_slot
+from compgs.numerics.linear import Reader
 
 # Biases are few: they keep more bits than the weights.
 BIAS_BITS = 14

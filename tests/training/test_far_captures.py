@@ -11,8 +11,8 @@ from compgs import metrics
 from compgs.config import Config
 from compgs.errors import NotEncodable
 from compgs.evaluation.importance import importance
+from compgs.numerics.rotations import rotation_from_quaternion
 from compgs.render import render
-from compgs.rotations import rotation_from_quaternion
 from compgs.scene import Points, Scene, load_scene
 from compgs.scene.colmap import read_sparse_model
 from compgs.scene.colmap_writer import write_sparse_model

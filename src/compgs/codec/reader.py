@@ -87,7 +87,9 @@ class FileInfo:
 
 
 def group_names(dimensions: Dimensions) -> list[str]:
-    """What people call the groups; a side group is named after the next one that takes it."""
+    """What people call the groups; a side group is named after the next one that takes it. No two share a name: of
+    several of a kind all but the first have their number.
+    """
     names = {
         Role.REFERENCE: "reference embeddings",
         Role.LOG_SCALES: "log scales",
@@ -103,7 +105,8 @@ def group_names(dimensions: Dimensions) -> list[str]:
             users[0] if users else shape.role, ""
         )
         result.append(f"{kind}hyperprior")
-    return result
+    counted = [(name, result[: i + 1].count(name)) for i, name in enumerate(result)]
+    return [name if count == 1 else f"{name} {count}" for name, count in counted]
 
 
 def read_content(data: bytes) -> FileContent:

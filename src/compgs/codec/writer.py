@@ -76,12 +76,14 @@ def write_content(
         Section(TABLES, encode_tables(tables)),
         Section(NETWORKS, encode_networks(networks)),
         Section(HEADS, encode_heads(content.heads)),
-        *_ranges(content, counts, chosen_levels(counts) if levels is None else levels),
     ]
+    ranges = _ranges(content, counts, chosen_levels(counts) if levels is None else levels)
+    padding = _padding(content, sections + ranges)
+    if padding:  # before the ranges, so that the beginnings of the file that are scenes are padded, too
+        sections.append(Section(PADDING, bytes(padding)))
     if content.metadata:
-        sections.append(Section(METADATA, encode_metadata(content.metadata)))
-    padding = _padding(content, sections)
-    return pack([*sections, Section(PADDING, bytes(padding))] if padding else sections)
+        ranges.append(Section(METADATA, encode_metadata(content.metadata)))
+    return pack(sections + ranges)
 
 
 def _positions(coordinates: np.ndarray, geometry: Geometry) -> Section:

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from compgs.linear import linear
 from compgs.model import residual_mlp
 from compgs.model.residual_mlp import NEGATIVE_SLOPE
+from compgs.numerics.linear import linear
 
 
 def _linear(inputs: int, outputs: int) -> tuple[nn.Parameter, nn.Parameter]:

@@ -20,10 +20,10 @@ from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.linear import Reader
 from compgs.model.fused import PairedPrediction
 from compgs.model.layers import ResidualMLP
 from compgs.model.primitives import Primitives
+from compgs.numerics.linear import Reader
 
 # Name, in a file, of the residual embeddings [K, residual_dim] that all anchors share where none has its own.
 SHARED_RESIDUALS = "residuals"

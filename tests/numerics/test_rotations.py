@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from compgs.rotations import nearest_rotation, quaternion_from_rotation, rotation_from_quaternion
+from compgs.numerics.rotations import nearest_rotation, quaternion_from_rotation, rotation_from_quaternion
 
 PART = st.floats(-1, 1)
 QUATERNION = (

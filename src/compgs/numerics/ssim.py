@@ -15,7 +15,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from compgs.vector_sums import add_in_any_order
+from compgs.numerics.vector_sums import add_in_any_order
 
 WINDOW_SIZE = 11
 WINDOW_SIGMA = 1.5
