@@ -6,3 +6,6 @@ export type { Kernels } from "./codec/kernels.ts";
 export { plainKernels } from "./codec/plain_kernels.ts";
 export type { Viewpoint, Viewpoints } from "./codec/viewpoints.ts";
 export * from "./errors.ts";
+export { gaussians, type Gaussians } from "./gaussians.ts";
+export { Predictor, type Appearance, type Geometry } from "./prediction/predictor.ts";
+export { type Camera, cameraCentre, poseOf } from "./cameras.ts";
