@@ -38,7 +38,7 @@ from compgs.codec.viewpoints import Viewpoint, Viewpoints  # noqa: E402
 from compgs.codec.writer import write_content  # noqa: E402
 from compgs.errors import BitstreamError  # noqa: E402
 
-FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
+FIELDS = {"means": 3, "quaternions": 4, "scales": 3, "opacities": 1, "colors": 3}  # columns
 STEPS = (0.25, 0.25, 0.25, 0.0625, 0.125, 0.0625)
 # Several groups of each role, coordinates as context, steps of their own, residuals in two groups.
 MANY_GROUPS = (
@@ -52,6 +52,7 @@ MANY_GROUPS = (
     GroupShape(Role.RESIDUAL, 3, (1.0, 0.5, 0.25), (2, 3, 5), sees_coordinates=True),
 )
 MUTANTS = 150
+STARTS = (b"", b"\x93", b"\x93CG", b"CGS", b"\x93CGS", b"\x93CGS\2\0", b"\x93CGS\1\0\5", b"PK\3\4")
 EVERY_LEVEL = [-1]  # in place of levels: a range for each that has anchors of its own
 
 
@@ -162,7 +163,7 @@ def expected(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 def _sound(values: dict[str, np.ndarray]) -> np.ndarray:  # [M] bool
     """Which primitives reach a renderer: the package leaves it to its renderers to skip those beyond float32."""
-    everything = np.concatenate([values[name].reshape(len(values["means"]), -1) for name in FIELDS], 1)
+    everything = np.concatenate([values[name].reshape(-1, columns) for name, columns in FIELDS.items()], 1)
     return (np.abs(everything) < 2.0**127).all(1) & (
         np.linalg.norm(values["quaternions"], axis=1) >= 2.0**-60
     )
@@ -198,16 +199,7 @@ def refused(files: dict[str, bytes]) -> list[dict[str, str]]:
         else:  # a damaged payload under checksums that match it
             _damage_payload(data, rng)
         cases.append({"data": base64.b64encode(bytes(data)).decode(), "error": _error(bytes(data))})
-    for start in (
-        b"",
-        b"\x93",
-        b"\x93CG",
-        b"CGS",
-        b"\x93CGS",
-        b"\x93CGS\x02\x00",
-        b"\x93CGS\x01\x00\x05",
-        b"PK\x03\x04",
-    ):
+    for start in STARTS:
         cases.append({"data": base64.b64encode(start).decode(), "error": _error(start)})
     return cases
 
