@@ -9,3 +9,4 @@ export * from "./errors.ts";
 export { gaussians, type Gaussians } from "./gaussians.ts";
 export { Predictor, type Appearance, type Geometry } from "./prediction/predictor.ts";
 export { type Camera, cameraCentre, poseOf } from "./cameras.ts";
+export { ProgressiveDecoder } from "./progressive.ts";

@@ -7,3 +7,8 @@ declare module "*.wasm" {
   const bytes: Uint8Array;
   export default bytes;
 }
+/** The worker's program, bundled by the build. */
+declare module "compgs:worker" {
+  const source: string;
+  export default source;
+}

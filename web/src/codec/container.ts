@@ -70,14 +70,19 @@ export function unpack(file: Uint8Array, prefix: boolean): Section[] {
         `${entry.name}: header promises ${entry.length} bytes, file ends after ${Math.max(0, file.length - entry.start)}`,
       );
     }
-    const payload = file.subarray(entry.start, end);
-    if (crc32(payload) !== entry.crc) throw new CorruptSection(`${entry.name}: checksum does not match`);
-    sections.push({ number: entry.number, name: entry.name, payload, end });
+    sections.push(unpackSection(file, entry));
   }
   const last = entries[entries.length - 1]!;
   const extra = file.length - (last.start + last.length);
   if (extra > 0) throw new CorruptSection(`file: ${extra} bytes after the last section`);
   return sections;
+}
+
+/** A section whose bytes are all there. */
+export function unpackSection(file: Uint8Array, { number, name, start, length, crc }: SectionEntry): Section {
+  const payload = file.subarray(start, start + length);
+  if (crc32(payload) !== crc) throw new CorruptSection(`${name}: checksum does not match`);
+  return { number, name, payload, end: start + length };
 }
 
 /** The section table of a file whose header is whole: checks 1 to 9. */
