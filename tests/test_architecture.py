@@ -47,8 +47,10 @@ ALLOWED = {
     "export": BASE | {"model"},
     "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
     "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "export"},
+    "viewer": BASE,
     "cli": BASE
-    | {"scene", "render", "model", "metrics", "codec", "export", "training", "evaluation", "trained_model"},
+    | {"scene", "render", "model", "metrics", "codec", "export", "training", "evaluation", "trained_model"}
+    | {"viewer"},
     "__main__": BASE | {"cli"},
 }
 

@@ -1,12 +1,16 @@
 /**
- * Builds dist/: the library, the viewer, and one page that has everything within it. Needs only the packages of
- * package-lock.json, and gives the same bytes wherever it runs.
+ * node build.mjs [FOLDER]: the library, the viewer, and one page that has everything within it, into FOLDER (dist).
+ *
+ * Needs only the packages of package-lock.json, and gives the same bytes wherever it runs.
  */
 
-import { mkdir, readFile, writeFile } from "node:fs/promises";
+import { readFile, writeFile } from "node:fs/promises";
+import { resolve } from "node:path";
+import { fileURLToPath } from "node:url";
 import { build } from "esbuild";
 
-const PAGE = "../src/compgs/viewer/page.html";
+const folder = resolve(process.argv[2] ?? "dist");
+process.chdir(fileURLToPath(new URL(".", import.meta.url)));
 
 const shared = {
   bundle: true,
@@ -34,13 +38,10 @@ const embedWorker = {
   },
 };
 
-await build({ ...shared, entryPoints: ["src/index.ts"], outfile: "dist/compgs.js" });
-await build({ ...shared, entryPoints: ["viewer/viewer.ts"], outfile: "dist/viewer.js", plugins: [embedWorker] });
+await build({ ...shared, entryPoints: ["src/index.ts"], outfile: `${folder}/compgs.js` });
+await build({ ...shared, entryPoints: ["viewer/viewer.ts"], outfile: `${folder}/viewer.js`, plugins: [embedWorker] });
 
 const script = await bundled("viewer/page.ts", { plugins: [embedWorker] });
 const template = await readFile("viewer/page.html", "utf8");
 // A function, as replacement patterns in the script must stay what they are.
-const page = template.replace("{{script}}", () => script.trim());
-await writeFile("dist/page.html", page);
-await mkdir(new URL("../src/compgs/viewer/", import.meta.url), { recursive: true });
-await writeFile(new URL(PAGE, import.meta.url), page);
+await writeFile(`${folder}/page.html`, template.replace("{{script}}", () => script.trim()));

@@ -2,8 +2,9 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { decode } from "../dist/compgs.js";
-import { fixtures, goldenFiles, hashesOf, refusedFiles } from "./fixtures.mjs";
+import { compgs, fixtures, goldenFiles, hashesOf, refusedFiles } from "./fixtures.mjs";
+
+const { decode } = compgs;
 
 for (const { name, bytes, hashes } of goldenFiles()) {
   test(`golden file ${name} decodes to its pinned integers`, () => {

@@ -3,7 +3,11 @@
 import { createHash } from "node:crypto";
 import { existsSync, readFileSync, readdirSync } from "node:fs";
 import { join } from "node:path";
-import { fileURLToPath } from "node:url";
+import { fileURLToPath, pathToFileURL } from "node:url";
+
+/** The library as it was built: into CGS_BUILD, or dist. */
+const built = process.env.CGS_BUILD ?? fileURLToPath(new URL("../dist", import.meta.url));
+export const compgs = await import(pathToFileURL(join(built, "compgs.js")));
 
 const GOLDEN = fileURLToPath(new URL("../../tests/golden", import.meta.url));
 /** Made by make_fixtures.py; without it only the golden files are looked at. */

@@ -2,8 +2,9 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { Predictor, decode, gaussians } from "../dist/compgs.js";
-import { fixtures } from "./fixtures.mjs";
+import { compgs, fixtures } from "./fixtures.mjs";
+
+const { Predictor, decode, gaussians } = compgs;
 
 const FIELDS = { means: 3, quaternions: 4, scales: 3, opacities: 1, colors: 3 };
 
