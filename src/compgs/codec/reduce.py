@@ -25,7 +25,7 @@ from compgs.errors import NotEncodable
 
 
 def without_coupled(content: FileContent, kept: np.ndarray) -> FileContent:
-    """Some of the P coupled primitives only (kept: [P] bool, in the file's order), and the anchors that have one."""
+    """The content with only the coupled primitives that are `kept`, [P] bool in the file's order, and their anchors."""
     mask = content.mask.copy()
     mask[mask] = kept
     anchors = mask.any(1)

@@ -174,6 +174,6 @@ def _reordered(content: FileContent, order: np.ndarray) -> FileContent:
 
 
 def _padding(content: FileContent, sections: list[Section]) -> int:
-    """Zero bytes to add to a file that says more than its size allows."""
+    """Number of zero bytes to add to a file whose content needs a longer file (`codec/limits.py`)."""
     size = container_bytes(len(sections)) + sum(len(section.data) for section in sections)
     return max(0, least_bytes(content) - size)
