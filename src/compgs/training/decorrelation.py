@@ -8,11 +8,11 @@ model, begins with a linear layer. So for any orthonormal U
 
 is the same scene, with rounding errors of the same size. Of all U the principal axes of the references (the
 Karhunen-Loeve transform; Goyal 2001, "Theoretical foundations of transform coding") leave Gaussian channels the least
-bits, and the file needs nothing new: the weights that it holds anyway absorb U. Anchors still move and come, so that it
-is done several times in a run.
+bits, and the file needs nothing new: the weights that it holds anyway absorb U. References change and anchors are added
+while training goes on, so this is done several times in a run.
 
-Adam moves all channels alike. Where the first axes hold most of what there is to say, and the last ones hardly leave
-zero, those would learn too slowly and these wander for nothing: learning rates follow the spread of the channels.
+Adam moves all channels alike. But the first axes hold most of the information and would learn too slowly, while the
+last ones hardly leave zero and would only wander. So the learning rates follow the spread of the channels.
 """
 
 from collections.abc import Iterator
@@ -58,7 +58,7 @@ def channel_rates(references: Tensor) -> Tensor:
 
 @torch.no_grad()
 def decorrelate(model: TrainedModel, optimizer: torch.optim.Optimizer) -> None:
-    """Turn the references into their principal axes, and with them all that reads them and Adam's moments."""
+    """Turn the references into their principal axes, and the layers that read them and Adam's moments accordingly."""
     axes = principal_axes(model.references)
     for parameter, dimension, first in _along_references(model):
         _turn(parameter.data, dimension, first, axes)

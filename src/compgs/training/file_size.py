@@ -14,14 +14,14 @@ OTHER_BYTES = 950  # names of tensors, scene, tables, viewpoints, metadata, cont
 
 
 def latent_bytes(model: TrainedModel) -> float:
-    """Of latents and positions; not finite if the latents are not."""
+    """Bytes of latents and positions; not finite if the latents are not."""
     anchors = int(model.mask.any(1).sum())
     return (sum(model.estimated_bits().values()) + POSITION_BITS * anchors) / 8
 
 
 @torch.no_grad()
 def fixed_bytes(model: TrainedModel) -> int:
-    """Of the networks and all that does not grow with the scene: no lambda makes it smaller."""
+    """Bytes of the networks and of all else that does not grow with the scene; no lambda makes them fewer."""
     e = model.config.entropy
     bits = 0.0
     for p in model.heads.parameters():

@@ -41,7 +41,7 @@ class TrainingStatus:
 
 @dataclass(frozen=True)
 class StepResult:
-    loss: Tensor  # []; a number only when somebody reads it: a GPU is not waited for
+    loss: Tensor  # []; a tensor, so that the CPU waits for the GPU only when somebody reads it
     image: Tensor  # [H, W, 3]
     view: View
 
@@ -99,7 +99,7 @@ def checkpoint_path(output: str | Path | None, *, resume: bool) -> Path | None:
 def kept_target(
     targets: dict[int, Target], view_index: int, views: Sequence[View], device: torch.device
 ) -> Target:
-    """The photograph of a view; each goes to the device once and stays there."""
+    """The photograph of a view, on the device; it is copied there once and kept."""
     if view_index not in targets:
         targets[view_index] = Target.from_image(views[view_index].image, device)
     return targets[view_index]
@@ -113,7 +113,7 @@ def next_view(order: list[int], views: int, shuffle: np.random.Generator) -> int
 
 
 def diverged(step: int, what: str, value: float) -> TrainingError:
-    """For a value that is not finite any more."""
+    """The error to raise for a value that is not finite any more."""
     return TrainingError(f"step {step}: the {what} is {value}; try a lower learning rate or another seed")
 
 
@@ -126,14 +126,14 @@ class Pace:
         self._steps = 0
 
     def step(self) -> None:
-        """A step is done."""
+        """Count a step."""
         if self._since is None:
             self._since = time.perf_counter()
         else:
             self._steps += 1
 
     def look(self) -> float:
-        """Smoothed, but not for long: kernels that are compiled later on say nothing of the rest either."""
+        """Seconds per step, smoothed; the mean is forgotten when steps become twice as fast, as after compiling."""
         now = time.perf_counter()
         if self._since is not None and self._steps:
             recent = (now - self._since) / self._steps
@@ -143,7 +143,7 @@ class Pace:
         return self.seconds
 
     def pause(self, seconds: float) -> None:
-        """Something else than steps took so long."""
+        """Leave out seconds that were spent on something else than steps."""
         if self._since is not None:
             self._since += seconds
 
