@@ -982,7 +982,8 @@ def read_rotation(fields: Fields) -> list[float]:
     numbers = [(bits >> 2 + 15 * i) & 0x7FFF for i in range(3)]
     numbers = [v - 2**15 if v >= 2**14 else v for v in numbers]
     squares = sum(v * v for v in numbers)
-    fields.require(squares <= 2 * 16383**2, "a rotation is longer than 1")
+    fields.require(min(numbers) >= -16383, f"a rotation has {numbers}, expected -16383 or more")
+    fields.require(squares <= 3 * 2**27, f"a rotation has {numbers}: the fourth is not the largest")
     rotation = [v / (16383 * math.sqrt(2)) for v in numbers]
     rotation.insert(largest, math.sqrt(1 - squares / (2 * 16383**2)))
     return rotation
@@ -1065,7 +1066,8 @@ def read_file(data: bytes, prefix: bool) -> File:
         else:
             sections[number] = payload
         at += length
-    require(prefix or at == len(data), "file", f"{len(data) - at} bytes after the last section")
+    else:
+        require(at == len(data), "file", f"{len(data) - at} bytes after the last section")
     return File(sections, latents, len(latents) == sum(number == LATENTS for number, _, _ in table))
 
 
