@@ -192,6 +192,7 @@ def test_values_out_of_range_are_usage_errors_in_the_words_of_the_option(
         (["encode", "full", "-o", "file"], "overwrite"),
         (["encode", "empty", "-o", "out.cgs"], "checkpoint.safetensors"),
         (["encode", "GOLDEN", "--drop", "0.5", "-o", "file"], "overwrite"),
+<<<<<<< HEAD
         (["encode", "file", "--drop", "0.5", "-o", "out.cgs"], "file: is not a .cgs file"),
         (["decode", "nowhere.cgs"], "nowhere.cgs"),
         (["decode", "empty"], "folder"),
@@ -203,6 +204,19 @@ def test_values_out_of_range_are_usage_errors_in_the_words_of_the_option(
         (["render", "GOLDEN", "-o", "full"], "overwrite"),
         (["evaluate", "nowhere.cgs", "scene"], "nowhere.cgs"),
         (["evaluate", "file", "scene"], "file: is not a .cgs file"),
+=======
+        (["encode", "file", "--drop", "0.5", "-o", "out.cgs"], "file: not a .cgs file"),
+        (["decode", "nowhere.cgs"], "nowhere.cgs"),
+        (["decode", "empty"], "folder"),
+        (["decode", "splats.ply"], "rendered and evaluated"),
+        (["decode", "file", "-o", "out"], "file: not a .cgs file"),
+        (["decode", "GOLDEN", "-o", "full"], "overwrite"),
+        (["render", "nowhere.cgs", "-o", "out"], "nowhere.cgs"),
+        (["render", "file", "-o", "out"], "file: not a .cgs file"),
+        (["render", "GOLDEN", "-o", "full"], "overwrite"),
+        (["evaluate", "nowhere.cgs", "scene"], "nowhere.cgs"),
+        (["evaluate", "file", "scene"], "file: not a .cgs file"),
+>>>>>>> wt-codectests
         (["evaluate", "GOLDEN", "scene", "-o", "full"], "overwrite"),
         (["info", "empty"], "folder"),
         (["info", "file"], "file: is not a .cgs file"),
@@ -327,3 +341,17 @@ def test_thread_counts_that_are_not_there_are_refused(
     code, _, err = outcome(capsys, "decode", tmp_path / "a.cgs", "--threads", threads)
     assert code == 2
     assert "expected 1 to" in err
+
+
+def test_info_lists_the_beginnings_of_a_file_that_are_scenes(capsys: pytest.CaptureFixture[str]) -> None:
+    """Octree level, anchors, bytes: the last one is all of them, but for the metadata behind it."""
+    file = GOLDEN_FILE.with_name("odd.cgs")
+    code, out, _ = outcome(capsys, "info", file)
+    assert code == 0 and "format version 2" in out
+    lines = [line.split() for line in out.splitlines()]
+    ranges = lines[
+        lines.index(["octree", "level", "anchors", "up", "to", "there", "bytes", "of", "the", "file"]) + 1 :
+    ]
+    assert [(level, anchors) for level, anchors, _ in ranges] == [("0", "1"), ("4", "60"), ("7", "70")]
+    sizes = [int(size.replace(",", "")) for _, _, size in ranges]
+    assert sizes == sorted(sizes) and sizes[-1] < file.stat().st_size < sizes[-1] + 60
