@@ -192,7 +192,6 @@ def test_values_out_of_range_are_usage_errors_in_the_words_of_the_option(
         (["encode", "full", "-o", "file"], "overwrite"),
         (["encode", "empty", "-o", "out.cgs"], "checkpoint.safetensors"),
         (["encode", "GOLDEN", "--drop", "0.5", "-o", "file"], "overwrite"),
-<<<<<<< HEAD
         (["encode", "file", "--drop", "0.5", "-o", "out.cgs"], "file: is not a .cgs file"),
         (["decode", "nowhere.cgs"], "nowhere.cgs"),
         (["decode", "empty"], "folder"),
@@ -204,19 +203,6 @@ def test_values_out_of_range_are_usage_errors_in_the_words_of_the_option(
         (["render", "GOLDEN", "-o", "full"], "overwrite"),
         (["evaluate", "nowhere.cgs", "scene"], "nowhere.cgs"),
         (["evaluate", "file", "scene"], "file: is not a .cgs file"),
-=======
-        (["encode", "file", "--drop", "0.5", "-o", "out.cgs"], "file: not a .cgs file"),
-        (["decode", "nowhere.cgs"], "nowhere.cgs"),
-        (["decode", "empty"], "folder"),
-        (["decode", "splats.ply"], "rendered and evaluated"),
-        (["decode", "file", "-o", "out"], "file: not a .cgs file"),
-        (["decode", "GOLDEN", "-o", "full"], "overwrite"),
-        (["render", "nowhere.cgs", "-o", "out"], "nowhere.cgs"),
-        (["render", "file", "-o", "out"], "file: not a .cgs file"),
-        (["render", "GOLDEN", "-o", "full"], "overwrite"),
-        (["evaluate", "nowhere.cgs", "scene"], "nowhere.cgs"),
-        (["evaluate", "file", "scene"], "file: not a .cgs file"),
->>>>>>> wt-codectests
         (["evaluate", "GOLDEN", "scene", "-o", "full"], "overwrite"),
         (["info", "empty"], "folder"),
         (["info", "file"], "file: is not a .cgs file"),
