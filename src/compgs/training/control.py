@@ -29,7 +29,7 @@ from compgs.training.optimizers import replace_rows
 # (gradient threshold factor, grid size in voxels), coarse first
 GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
 # lambda at which settings of growth and pruning are meant as they are given, and the range in which they follow it:
-# below 1e-6 more anchors took half as many bytes again and brought nothing (docs/results/experiments.md, fifth series)
+# below 1e-6 more anchors took half as many bytes again and brought nothing (docs/results/decisions.md)
 USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 COORDINATE_LIMIT = 1 << 20  # voxels: what the octree coder can hold
 # Steps: with fewer views than that, passes are counted as if there were as many, or control would come every few steps.

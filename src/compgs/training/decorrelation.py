@@ -27,7 +27,7 @@ from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import replace_parameter
 
 # Learning rate of a channel that spreads over one step; it goes with the root of the spread, down to the second number.
-# Rates a seventh higher and lower came out alike (docs/results/experiments.md, sixth series).
+# Rates a seventh higher and lower came out alike (docs/results/decisions.md).
 RATE_OF_ONE, SMALLEST_RATE = 1.75, 0.6
 # Spread in steps below which a channel is dropped: one symbol in ten is other than zero there; 0.25 and 0.35 came out
 # alike.

@@ -2,7 +2,7 @@
 
 Where few views look, a handful of primitives in front of each camera can explain its photograph and be wrong from
 everywhere else. Whatever must do without some of its neighbours now and then cannot rely on such a trick. With many
-views there is nothing to gain (docs/results/experiments.md, fourth series).
+views there is nothing to gain (docs/results/decisions.md).
 """
 
 from collections.abc import Callable
