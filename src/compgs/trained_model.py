@@ -13,8 +13,8 @@ from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.entropy.models import EntropyModel, Quantized, starting_residuals
 from compgs.entropy.quantization import quantize_weight
+from compgs.model.heads import HeadDimensions, make_heads
 from compgs.model.hybrid_model import HybridModel
-from compgs.model.prediction import PredictionHeads
 from compgs.model.primitives import Primitives, every_slot
 from compgs.numerics.linear import Reader
 
@@ -57,7 +57,7 @@ class TrainedModel(nn.Module):
         # Cameras of the world that stand for all that the scene was trained on, the first for them best; its sky.
         self.viewpoints: tuple[Camera, ...] = ()
         self.up: tuple[float, float, float] = (0.0, -1.0, 0.0)
-        self.heads = PredictionHeads(m.reference_dim, m.residual_dim, m.width, m.heads)
+        self.heads = make_heads(m.heads, HeadDimensions(m.reference_dim, m.residual_dim, m.width))
         self.entropy = EntropyModel(m, config.entropy)
         self.register_buffer("coordinates", coordinates.to(torch.int32))
         self.register_buffer("mask", torch.ones(n, m.coupled_primitives, dtype=torch.bool))
