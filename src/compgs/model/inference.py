@@ -24,6 +24,15 @@ class GeometryArrays:
     scales: np.ndarray  # [P, 3] standard deviations
     quaternions: np.ndarray  # [P, 4] w-x-y-z, not normalized
 
+    @classmethod
+    def empty(cls, coupled: int) -> "GeometryArrays":
+        """Room for so many primitives."""
+        return cls(*(np.empty((coupled, size), np.float32) for size in (3, 3, 4)))
+
+    @property
+    def fields(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.means, self.scales, self.quaternions
+
 
 @dataclass(frozen=True, eq=False)
 class DrawnArrays:
@@ -64,8 +73,7 @@ class HeadArrays(ABC):
     def geometry(self, primitives: PrimitiveArrays, first_coupled: np.ndarray) -> GeometryArrays:
         """Of all coupled primitives."""
         p, spread = primitives, primitives.spread()
-        coupled = len(p.residuals)
-        means, scales, quaternions = (np.empty((coupled, size), np.float32) for size in (3, 3, 4))
+        geometry = GeometryArrays.empty(len(p.residuals))
         for a in range(0, len(p), BLOCK):
             anchors = slice(a, min(a + BLOCK, len(p)))
             part = slice(first_coupled[anchors.start], first_coupled[anchors.stop])
@@ -75,11 +83,9 @@ class HeadArrays(ABC):
                 index,
                 p.positions[anchors],
                 spread[anchors],
-                means[part],
-                scales[part],
-                quaternions[part],
+                *(field[part] for field in geometry.fields),
             )
-        return GeometryArrays(means, scales, quaternions)
+        return geometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,14 +114,13 @@ class PairedArrays(HeadArrays):
             counts,
         )
         offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
-        m, g = int(offsets[-1]), scene.geometry
-        index, opacities = np.empty(m, np.int64), np.empty(m, np.float32)
-        means, scales, quaternions, colors = (np.empty((m, size), np.float32) for size in (3, 3, 4, 3))
+        m = int(offsets[-1])
+        index, geometry = np.empty(m, np.int64), GeometryArrays.empty(m)
+        opacities, colors = np.empty(m, np.float32), np.empty((m, 3), np.float32)
         kernels.gather_drawn(
-            *where, appearance, offsets, g.means, g.scales, g.quaternions,
-            index, means, scales, quaternions, opacities, colors,
-        )  # fmt: skip
-        return DrawnArrays(index, GeometryArrays(means, scales, quaternions), opacities, colors)
+            *where, appearance, offsets, *scene.geometry.fields, index, *geometry.fields, opacities, colors
+        )
+        return DrawnArrays(index, geometry, opacities, colors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +149,6 @@ class SeparateArrays(HeadArrays):
         index, colors = coupled[shown], np.empty((len(shown), 3), np.float32)
         raw = self.color_network.apply(seen, p.residuals, row[shown], index)
         kernels.activate_colors(raw, np.arange(len(shown)), colors)
-        g = scene.geometry
-        geometry = GeometryArrays(g.means[index], g.scales[index], g.quaternions[index])
+        g, geometry = scene.geometry, GeometryArrays.empty(len(index))
+        kernels.gather_geometry(index, *g.fields, *geometry.fields)
         return DrawnArrays(index, geometry, opacities[shown], colors)

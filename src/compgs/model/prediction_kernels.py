@@ -185,6 +185,26 @@ def _see_block(anchors, positions, references, center, distance_unit, seen):
         seen[i, D + 3] = distance / distance_unit
 
 
+@njit(parallel=True, cache=True)
+def gather_geometry(
+    index,  # [M] int64: those wanted
+    means,  # [P, 3], and so on: of all
+    scales,
+    quaternions,
+    drawn_means,  # [M, 3], and so on, written
+    drawn_scales,
+    drawn_quaternions,
+):
+    for block in prange((len(index) + ROWS - 1) // ROWS):
+        for j in range(block * ROWS, min(len(index), (block + 1) * ROWS)):
+            p = index[j]
+            for c in range(3):
+                drawn_means[j, c] = means[p, c]
+                drawn_scales[j, c] = scales[p, c]
+            for c in range(4):
+                drawn_quaternions[j, c] = quaternions[p, c]
+
+
 def block_count(anchors: int) -> int:
     return -(-anchors // ANCHORS)
 
