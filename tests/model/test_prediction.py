@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from compgs.cameras import Camera
-from compgs.model import HybridModel, PredictionHeads, Primitives, predict
-from compgs.model.prediction import OPACITY_CUTOFF, affine_transform, view_embedding
+from compgs.model import HeadDimensions, HybridModel, Primitives, make_heads, predict
+from compgs.model.constants import OPACITY_CUTOFF
+from compgs.model.prediction import affine_transform, view_embedding
 from compgs.model.primitives import every_slot, select_anchors
 
 N, K, D, G = 40, 5, 12, 8
@@ -34,7 +35,7 @@ def primitives():
 
 def heads(layout):
     torch.manual_seed(0)
-    return PredictionHeads(D, G, 16, layout)
+    return make_heads(layout, HeadDimensions(D, G, 16))
 
 
 CENTER = torch.tensor([0.3, -2.0, 5.0])

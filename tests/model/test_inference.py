@@ -7,10 +7,17 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.model import HybridModel, PredictionHeads, Primitives, hybrid_model, predict
-from compgs.model.appearance import ANCHORS, sigmoid
+from compgs.model import (
+    HeadDimensions,
+    HybridModel,
+    Primitives,
+    hybrid_model,
+    make_heads,
+    predict,
+)
+from compgs.model.prediction_kernels import sigmoid
 from compgs.model.primitives import select_anchors
-from compgs.model.residual_mlp import ROWS
+from compgs.model.residual_mlp_kernels import ANCHORS, ROWS
 
 N, D, G = 3 * ANCHORS + 17, 12, 8
 FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
@@ -32,7 +39,7 @@ def make_model(counts: torch.Tensor, positions: torch.Tensor | None = None) -> H
         anchor_index=torch.repeat_interleave(counts),
         voxel_size=0.05,
     )
-    heads = PredictionHeads(D, G, 16, "paired").requires_grad_(False)
+    heads = make_heads("paired", HeadDimensions(D, G, 16)).requires_grad_(False)
     return HybridModel(primitives, heads, 4.0, (0.0, 0.0, 0.0))
 
 
@@ -42,7 +49,7 @@ def truth(model: HybridModel, visible: torch.Tensor) -> Gaussians:
     wide = Primitives(
         *(getattr(p, name).double() for name in names), anchor_index=p.anchor_index, voxel_size=p.voxel_size
     )
-    heads = PredictionHeads(D, G, 16, "paired").double()
+    heads = make_heads("paired", HeadDimensions(D, G, 16)).double()
     heads.load_state_dict(model.heads.state_dict())
     return predict(heads, wide, torch.tensor(CAMERA.center), model.distance_unit).gaussians
 
