@@ -1,4 +1,4 @@
-"""The compiled way from anchors in view to Gaussians, against plain torch in float64."""
+"""The way from anchors in view to Gaussians by kernels on arrays, against plain torch in float64."""
 
 import numba
 import numpy as np
@@ -6,16 +6,16 @@ import pytest
 import torch
 
 from compgs.cameras import Camera
-from compgs.gaussians import Gaussians
 from compgs.model import (
     HeadDimensions,
     HybridModel,
     Primitives,
     hybrid_model,
+    inference,
     make_heads,
     predict,
 )
-from compgs.model.prediction_kernels import sigmoid
+from compgs.model.prediction import Prediction, predict_geometry
 from compgs.model.primitives import select_anchors
 from compgs.model.residual_mlp_kernels import ANCHORS, ROWS
 
@@ -26,8 +26,11 @@ POSE[:3, 3] = (0.3, -1.0, 2.0)
 CAMERA = Camera(POSE, 50, 50, 32, 32, 64, 64)
 
 
-def make_model(counts: torch.Tensor, positions: torch.Tensor | None = None) -> HybridModel:
-    """counts: [N] coupled primitives of each anchor."""
+def make_model(
+    counts: torch.Tensor,  # [N] coupled primitives of each anchor
+    positions: torch.Tensor | None = None,
+    layout: str = "paired",
+) -> HybridModel:
     g = torch.Generator().manual_seed(3)
     torch.manual_seed(0)
     n = len(counts)
@@ -39,19 +42,19 @@ def make_model(counts: torch.Tensor, positions: torch.Tensor | None = None) -> H
         anchor_index=torch.repeat_interleave(counts),
         voxel_size=0.05,
     )
-    heads = make_heads("paired", HeadDimensions(D, G, 16)).requires_grad_(False)
+    heads = make_heads(layout, HeadDimensions(D, G, 16)).requires_grad_(False)
     return HybridModel(primitives, heads, 4.0, (0.0, 0.0, 0.0))
 
 
-def truth(model: HybridModel, visible: torch.Tensor) -> Gaussians:
+def truth(model: HybridModel, visible: torch.Tensor, layout: str) -> Prediction:
     p = select_anchors(model.primitives, visible)
     names = ("positions", "log_scales", "references", "residuals")
     wide = Primitives(
         *(getattr(p, name).double() for name in names), anchor_index=p.anchor_index, voxel_size=p.voxel_size
     )
-    heads = make_heads("paired", HeadDimensions(D, G, 16)).double()
+    heads = make_heads(layout, HeadDimensions(D, G, 16)).double()
     heads.load_state_dict(model.heads.state_dict())
-    return predict(heads, wide, torch.tensor(CAMERA.center), model.distance_unit).gaussians
+    return predict(heads, wide, torch.tensor(CAMERA.center), model.distance_unit)
 
 
 def counts_with(*special: int) -> torch.Tensor:
@@ -61,21 +64,41 @@ def counts_with(*special: int) -> torch.Tensor:
     return counts
 
 
+@pytest.mark.parametrize("layout", ["paired", "separate"])
 @pytest.mark.parametrize("special", [(0, 0, 1), (ROWS, 0, ROWS - 1), (3 * ROWS + 1, ROWS + 1)])
 @pytest.mark.parametrize("share", [0.02, 0.6, 1.0])
-def test_gaussians_agree_with_float64_whatever_the_number_of_primitives(special, share):
-    model = make_model(counts_with(*special))
+def test_gaussians_agree_with_float64_whatever_the_number_of_primitives(special, share, layout):
+    model = make_model(counts_with(*special), layout=layout)
     visible = torch.rand(N, generator=torch.Generator().manual_seed(5)) < share
-    found, expected = model.gaussians(CAMERA, visible), truth(model, visible)
-    assert len(found) == len(expected) > 0
+    found, index = model.drawn(CAMERA, visible)
+    expected = truth(model, visible, layout)
+    # Rows of the primitives of visible anchors, in all and one after the other.
+    rows = torch.nonzero(visible[model.primitives.anchor_index]).view(-1)
+    assert torch.equal(index, rows[expected.index])
+    assert len(found) > 0
     for name in FIELDS:
         torch.testing.assert_close(
-            getattr(found, name).double(), getattr(expected, name), atol=2e-6, rtol=1e-5
+            getattr(found, name).double(), getattr(expected.gaussians, name), atol=2e-6, rtol=1e-5
         )
 
 
-def test_parts_of_a_frame_together_are_the_frame(monkeypatch):
-    model = make_model(counts_with(ROWS, 0, 3))
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("block", [1, ANCHORS, ANCHORS + 1])
+def test_geometry_is_the_same_in_blocks_of_any_size(monkeypatch, layout, block):
+    model = make_model(counts_with(ROWS, 0, 3), layout=layout)
+    monkeypatch.setattr(inference, "BLOCK", block)
+    p, heads = model.primitives, make_heads(layout, HeadDimensions(D, G, 16)).double()
+    heads.load_state_dict(model.heads.state_dict())
+    names = ("positions", "log_scales", "references", "residuals")
+    wide = Primitives(*(getattr(p, name).double() for name in names), p.anchor_index, p.voxel_size)
+    expected = predict_geometry(heads, wide, wide.residuals, wide.anchor_index)
+    for found, exact in zip(model.geometry, expected, strict=True):
+        torch.testing.assert_close(found.double(), exact, atol=2e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+def test_parts_of_a_frame_together_are_the_frame(monkeypatch, layout):
+    model = make_model(counts_with(ROWS, 0, 3), layout=layout)
     whole = model.gaussians(CAMERA)
     monkeypatch.setattr(hybrid_model, "FRAME_BLOCK", ANCHORS)
     parts = list(model.parts(CAMERA))
@@ -84,9 +107,10 @@ def test_parts_of_a_frame_together_are_the_frame(monkeypatch):
         assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(whole, name))
 
 
-def test_an_anchor_at_the_camera_has_finite_colors():
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+def test_an_anchor_at_the_camera_has_finite_colors(layout):
     center = torch.tensor(CAMERA.center, dtype=torch.float32)
-    model = make_model(torch.full((3,), 5), positions=center.repeat(3, 1))
+    model = make_model(torch.full((3,), 5), positions=center.repeat(3, 1), layout=layout)
     assert torch.isfinite(model.gaussians(CAMERA).colors).all()
 
 
@@ -101,12 +125,3 @@ def test_gaussians_do_not_depend_on_the_number_of_threads():
         numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     for name in FIELDS:
         assert torch.equal(getattr(one, name), getattr(two, name))
-
-
-def test_the_sigmoid_is_right_to_single_precision_everywhere():
-    x = np.concatenate([np.linspace(-100, 100, 40_001), [-1e30, -np.inf, np.inf, 1e30, 0.0]])
-    x = x.astype(np.float32)
-    found = numba.vectorize(["f4(f4)"])(lambda t: sigmoid(t))(x)
-    with np.errstate(over="ignore"):
-        expected = 1 / (1 + np.exp(-x.astype(np.float64)))
-    assert np.abs(found - expected).max() < 2e-7
