@@ -13,8 +13,9 @@ from compgs.codec.decoder import decode
 from compgs.codec.reader import read_latents
 from compgs.codec.writer import write_content
 from compgs.gaussians import Gaussians
-from compgs.model import HybridModel, PredictionHeads, Primitives, predict
-from compgs.model.prediction import OPACITY_CUTOFF
+from compgs.model import HeadDimensions, HybridModel, Primitives, predict
+from compgs.model.constants import OPACITY_CUTOFF
+from compgs.model.heads import make_heads as new_heads
 
 ROOT = Path(__file__).parents[2]
 sys.path += [str(ROOT / "tools"), str(ROOT / "benchmarks")]
@@ -68,12 +69,8 @@ def model_of(content: Content) -> HybridModel:
             torch.arange(k).repeat(n)[torch.from_numpy(content.mask).view(-1)]
         ]
     network = "appearance" if content.layout == "paired" else "opacity"
-    heads = PredictionHeads(
-        content.references.shape[1],
-        residuals.shape[1],
-        len(tensors[f"{network}.input_bias"]),
-        content.layout,
-    )
+    width = len(tensors[f"{network}.input_bias"])
+    heads = new_heads(content.layout, HeadDimensions(content.references.shape[1], residuals.shape[1], width))
     heads.load_state_dict(tensors)
     primitives = Primitives(
         positions=torch.from_numpy(content.coordinates * content.voxel_size).float(),
@@ -153,7 +150,9 @@ def test_a_world_offset_moves_the_camera_and_nothing_else() -> None:
 @pytest.mark.parametrize("layout", ["paired", "separate"])
 def test_made_up_heads_have_the_tensors_of_the_package(layout: str) -> None:
     d = make_dimensions(3, paper_groups(5, 4, 1, 1), layout, 7)
-    expected = {name: tuple(p.shape) for name, p in PredictionHeads(5, 4, 7, layout).named_parameters()}
+    expected = {
+        name: tuple(p.shape) for name, p in new_heads(layout, HeadDimensions(5, 4, 7)).named_parameters()
+    }
     heads = make_heads(np.random.default_rng(1), d)
     assert {name: tensor.values.shape for name, tensor in heads} == head_shapes(d) == expected
     shared = head_shapes(make_dimensions(3, paper_groups(5, 0, 1), layout, 7, 4))
