@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from compgs.cameras import Camera
-from compgs.codec.content import Dimensions
 from compgs.codec.decoder import from_latents
 from compgs.codec.reader import read_latents
 from compgs.codec.writer import write_content
@@ -22,15 +21,15 @@ from compgs.gaussians import Gaussians
 from compgs.model import HybridModel
 
 sys.path.append(str(Path(__file__).parent.parent / "tools"))
-from made_content import make_content
+from made_content import make_content, make_dimensions, paper_groups
 from made_heads import make_heads
 from make_golden_gaussians import plain_content
 from plain_prediction import CUTOFF, Arrays, Content, primitives, rounded, stacked, tolerances
 
 DIMENSIONS = (
-    Dimensions(),
-    Dimensions(heads="separate"),
-    Dimensions(3, 256, 64, 2, 2, "paired", 512),
+    make_dimensions(),
+    make_dimensions(heads="separate"),
+    make_dimensions(3, paper_groups(256, 64, 2, 2), "paired", 512),
 )
 FIELDS = {
     "mean": "means",

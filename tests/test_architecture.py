@@ -143,6 +143,15 @@ def test_from_bytes_to_symbols_no_torch_is_loaded(module: str) -> None:
     assert "torch" not in loaded
 
 
+@pytest.mark.parametrize(
+    "module", ["constants", "arrays", "residual_mlp_kernels", "prediction_kernels", "inference"]
+)
+def test_from_arrays_to_gaussians_no_torch_is_loaded(module: str) -> None:
+    loaded = modules_after(f"import compgs.model.{module}")
+    assert f"compgs.model.{module}" in loaded
+    assert "torch" not in loaded
+
+
 def test_public_names_exist() -> None:
     for name in compgs.__all__:
         assert getattr(compgs, name) is not None

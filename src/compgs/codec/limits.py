@@ -37,9 +37,9 @@ def symbols(dimensions: Dimensions, anchors: int) -> int:
     return anchors * dimensions.symbols_per_anchor()
 
 
-def least_bytes(content: FileContent) -> int:
-    """Bytes that a file of this content must have at least."""
-    anchors, coupled = len(content.coordinates), int(content.mask.sum())
+def least_bytes(content: FileContent, anchors: int) -> int:
+    """Bytes that a file needs at least up to so many of the content's anchors, in canonical order."""
+    coupled = int(content.mask[:anchors].sum())
     products = sum(g.prior.products for g in content.groups if isinstance(g.prior, IntegerNetwork))
     weights = sum(tensor.values.size for _, tensor in content.heads)
     amounts = (

@@ -12,10 +12,8 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
+from compgs.model.constants import CUTOFF_SIGMAS
 from compgs.model.spherical_harmonics import coefficients, view_colors
-
-# An opaque splat falls below 1/255 at sqrt(2 ln 255) = 3.33 standard deviations.
-CUTOFF_SIGMAS = 3.34
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,7 +107,7 @@ def keep_channels(
         change = partial(_narrowed, dimension=dimension, first=first, kept=entries)
         replace_parameter(model, optimizer, parameter, change)
     network.keep_channels(kept)
-    for head in model.heads.networks():
+    for _, head in model.heads.networks():
         head.anchor_dim -= len(kept) - model.reference_dim
 
 

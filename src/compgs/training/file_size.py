@@ -10,7 +10,8 @@ from compgs.entropy.quantization import weight_exponent
 from compgs.trained_model import BIAS_BITS, TrainedModel
 
 POSITION_BITS = 10.0  # of an anchor's position, about
-OTHER_BYTES = 950  # names of tensors, scene, tables, viewpoints, metadata, container, about
+OTHER_BYTES = 600  # names of tensors, scene, tables, metadata, container, about
+LENS_BYTES, VIEWPOINT_BYTES = 32, 13  # of the cameras that the file keeps
 
 
 def latent_bytes(model: TrainedModel) -> float:
@@ -33,7 +34,8 @@ def fixed_bytes(model: TrainedModel) -> int:
             # In halves, as the file has them: means and scales differ in spread.
             bits += sum(gaussian_entropy(half) for half in scaled.tensor_split(2))
             bits += sum(gaussian_entropy(half * 2.0**FRACTION_BITS) for half in bias.tensor_split(2))
-    return int(bits / 8) + OTHER_BYTES
+    kept = min(len(model.viewpoints), model.config.training.viewpoints)
+    return int(bits / 8) + OTHER_BYTES + (LENS_BYTES + VIEWPOINT_BYTES * kept if kept else 0)
 
 
 def gaussian_entropy(values: Tensor) -> float:

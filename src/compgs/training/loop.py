@@ -19,6 +19,7 @@ from compgs.training.allocation import freed_memory_kept
 from compgs.training.checkpoint import CHECKPOINT_NAME
 
 REPORT_EVERY = 10  # steps between two status reports
+KEPT_BYTES = 8 << 30  # of photographs on a GPU, 3 bytes a pixel
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it may look at every primitive
 
 
@@ -99,9 +100,16 @@ def checkpoint_path(output: str | Path | None, *, resume: bool) -> Path | None:
 def kept_target(
     targets: dict[int, Target], view_index: int, views: Sequence[View], device: torch.device
 ) -> Target:
-    """The photograph of a view, on the device; it is copied there once and kept."""
+    """The photograph of a view. On the CPU it shares the memory of the view's image, which the scene keeps or reads
+    again; it is copied to a GPU once and kept there while there is room.
+    """
+    if device.type == "cpu":
+        return Target.from_image(views[view_index].image)
     if view_index not in targets:
-        targets[view_index] = Target.from_image(views[view_index].image, device)
+        target = Target.from_image(views[view_index].image, device)
+        while targets and sum(t.image.numel() for t in targets.values()) + target.image.numel() > KEPT_BYTES:
+            del targets[next(iter(targets))]
+        targets[view_index] = target
     return targets[view_index]
 
 

@@ -299,8 +299,8 @@ class Trainer:
         parts = []
         for rows in torch.arange(model.anchors, device=self.device).split(20_000):
             p = model.primitives(model.quantized(rows, stored_weights=False), rows)
-            raw = model.heads("geometry", p.references, p.residuals, p.anchor_index)
-            means = p.positions[p.anchor_index] + raw[:, :3] * p.offset_scales[p.anchor_index]
+            raw = model.heads.raw_geometry(p.references, p.residuals, p.anchor_index)
+            means = p.positions[p.anchor_index] + raw[:, :3] * p.reach[p.anchor_index]
             parts.append(means.view(-1, k, 3))
         return torch.cat(parts)
 

@@ -2,7 +2,7 @@ import numba
 import pytest
 import torch
 
-from compgs.model import PredictionHeads, Primitives, predict
+from compgs.model import HeadDimensions, Primitives, make_heads, predict
 from compgs.model.primitives import every_slot
 
 N, K, D, G = 300, 5, 12, 8
@@ -20,7 +20,7 @@ def prediction(dtype, *, revived=False):
     opacities of what is not drawn.
     """
     torch.manual_seed(0)
-    heads = PredictionHeads(D, G, 16, "paired").to(dtype)
+    heads = make_heads("paired", HeadDimensions(D, G, 16)).to(dtype)
     positions, log_scales, references, residuals = inputs(dtype)
     index = every_slot(N, K)
     primitives = Primitives(positions.detach() * 3, log_scales, references, residuals, index, 0.05)
