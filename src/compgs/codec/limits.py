@@ -37,8 +37,9 @@ def symbols(dimensions: Dimensions, anchors: int) -> int:
     return anchors * dimensions.symbols_per_anchor()
 
 
-def least_bytes(content: FileContent, anchors: int) -> int:
-    """Bytes that a file needs at least up to so many of the content's anchors, in canonical order."""
+def least_bytes(content: FileContent, anchors: int | None = None) -> int:
+    """Bytes that a file needs at least, or its beginning up to so many of the content's anchors (canonical order)."""
+    anchors = len(content.coordinates) if anchors is None else anchors
     coupled = int(content.mask[:anchors].sum())
     products = sum(g.prior.products for g in content.groups if isinstance(g.prior, IntegerNetwork))
     weights = sum(tensor.values.size for _, tensor in content.heads)
