@@ -90,6 +90,8 @@ class HeadArrays(ABC):
 
 @dataclass(frozen=True, eq=False)
 class PairedArrays(HeadArrays):
+    """Two networks; opacity and color of a view come from one pass of kernels."""
+
     geometry_network: MLPArrays
     appearance_network: MLPArrays
 
@@ -125,6 +127,8 @@ class PairedArrays(HeadArrays):
 
 @dataclass(frozen=True, eq=False)
 class SeparateArrays(HeadArrays):
+    """Four networks; colors are predicted of those that are drawn alone."""
+
     translation_network: MLPArrays
     covariance_network: MLPArrays
     opacity_network: MLPArrays

@@ -60,6 +60,16 @@ def view_embedding(
     return torch.cat([offset / distance.clamp_min(SMALLEST_DISTANCE), distance / distance_unit], 1)
 
 
+def see(
+    references: Tensor,  # [N, reference_dim] of anchors
+    positions: Tensor,  # [N, 3] of the same, world units
+    camera_center: Tensor,  # [3] world units
+    distance_unit: float,  # world units
+) -> Tensor:  # [N, reference_dim + 4]
+    """What the networks of opacity and color take of an anchor: reference embedding, then view embedding."""
+    return torch.cat([references, view_embedding(positions, camera_center, distance_unit)], 1)
+
+
 def opacity_activation(raw: Tensor) -> Tensor:
     """[P, 1 or more] raw numbers of which opacity is the first -> [P] opacities, -1 to 1."""
     return torch.tanh(raw[:, 0])
@@ -111,8 +121,7 @@ def predict(
     primitives, those that are not drawn with opacity 0; the same image and gradients by more arithmetic, but a GPU need
     not be waited for to learn how many there are. `appearance_dtype`: of the networks of opacity and color.
     """
-    view = view_embedding(primitives.positions, camera_center, distance_unit)
-    seen = torch.cat([primitives.references, view], 1)
+    seen = see(primitives.references, primitives.positions, camera_center, distance_unit)
     function = _drawn if compact else _all
     if weights is None:
         return function(heads, primitives, seen, appearance_dtype)
