@@ -25,7 +25,7 @@ from compgs.entropy.factorized import FactorizedDensity
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import NotEncodable
-from compgs.model.prediction import SHARED_RESIDUALS
+from compgs.model.constants import SHARED_RESIDUALS
 from compgs.outputs import check_output_file, write_bytes
 from compgs.trained_model import BIAS_BITS, SHARED_RESIDUAL_BITS, TrainedModel
 

@@ -46,7 +46,7 @@ class DrawnArrays:
 
 @dataclass(frozen=True, eq=False)
 class SceneArrays:
-    """A scene whose geometry is known."""
+    """A scene whose geometry is known: all that a view needs, but for the networks."""
 
     primitives: PrimitiveArrays
     first_coupled: np.ndarray  # [N + 1] int64: first coupled primitive of each anchor
