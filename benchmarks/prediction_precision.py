@@ -19,6 +19,7 @@ from compgs.codec.reader import read_latents
 from compgs.codec.writer import write_content
 from compgs.gaussians import Gaussians
 from compgs.model import HybridModel
+from compgs.model.prediction import predict_by_torch, see
 
 sys.path.append(str(Path(__file__).parent.parent / "tools"))
 from made_content import make_content, make_dimensions, paper_groups
@@ -51,6 +52,14 @@ def arrays(gaussians: Gaussians) -> Arrays:
     return {name: getattr(gaussians, field).double().numpy() for name, field in FIELDS.items()}
 
 
+def by_torch(model: HybridModel, camera: Camera) -> Gaussians:
+    """The readable prediction in float32; its networks run in kernels."""
+    p, center = model.primitives, torch.tensor(camera.center, dtype=torch.float32)
+    seen = see(p.references, p.positions, center, model.distance_unit)
+    with torch.no_grad():
+        return predict_by_torch(model.heads, p, seen).gaussians
+
+
 def deviations(found: Arrays, truth: Arrays) -> dict[str, float]:
     """Largest deviation of each kind of number, in units of its tolerance."""
     allowed = tolerances(truth)
@@ -69,7 +78,7 @@ def ways() -> dict[str, Callable[[HybridModel, Content, Camera, list[int]], Arra
 
     return {
         "kernels": lambda model, _, camera, rows: arrays(model.gaussians(camera)),
-        "torch": lambda model, _, camera, rows: arrays(model.drawn(camera)[0]),
+        "torch": lambda model, _, camera, rows: arrays(by_torch(model, camera)),
         "numpy, float32": plain(np.float32),
         "numpy, float16": plain(np.float16),
     }

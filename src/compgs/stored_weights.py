@@ -6,7 +6,7 @@ from torch import Tensor
 
 from compgs.config import EntropyConfig
 from compgs.entropy.quantization import quantize_weight
-from compgs.model.prediction import SHARED_RESIDUALS
+from compgs.model.constants import SHARED_RESIDUALS
 
 BIAS_BITS = 14  # biases are few: they keep more bits than the weights
 SHARED_RESIDUAL_BITS = 10  # residual embeddings that all anchors share are few, too

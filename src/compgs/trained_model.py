@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.entropy.models import EntropyModel, Quantized, starting_residuals
+from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.heads import HeadDimensions, make_heads
 from compgs.model.hybrid_model import HybridModel
-from compgs.model.prediction import SHARED_RESIDUALS
 from compgs.model.primitives import Primitives, every_slot
 from compgs.numerics.linear import Reader
 from compgs.stored_weights import StoredWeights

@@ -14,9 +14,9 @@ from compgs.codec.integer_network import FRACTION_BITS
 from compgs.codec.reader import read_latents
 from compgs.codec.viewpoint_cameras import camera_from_viewpoint
 from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile
+from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.heads import HeadDimensions, make_heads
 from compgs.model.hybrid_model import HybridModel
-from compgs.model.prediction import SHARED_RESIDUALS
 from compgs.model.primitives import Primitives
 
 # Primitives of an anchor that stands for m anchors, of which only it has arrived, are m to this power as large: their

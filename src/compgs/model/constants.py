@@ -1,6 +1,8 @@
-"""The numbers of Sec. 3.2 that the readable prediction and its kernels share (docs/bitstream_prediction.md)."""
+"""What the readable prediction, its kernels and the files share of Sec. 3.2 (docs/bitstream_prediction.md)."""
 
 VIEW_DIM = 4  # view embedding: unit direction (3) and distance (1)
+# Name, in a file, of the residual embeddings [K, residual_dim] that all anchors share where none has its own.
+SHARED_RESIDUALS = "residuals"
 # Slope of the leaky ReLU below zero: a power of two, as in the entropy networks.
 NEGATIVE_SLOPE = 2.0**-6
 # Opacity that a primitive must exceed to be drawn: a splat below it touches no pixel in any rasterizer.

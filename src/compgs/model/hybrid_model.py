@@ -18,7 +18,7 @@ from compgs.model.prediction import (
     predict_appearance,
     predict_geometry,
     runs_in_kernels,
-    view_embedding,
+    see,
 )
 from compgs.model.primitives import Primitives, anchor_range
 
@@ -44,14 +44,10 @@ class HybridModel:
     heads: PredictionHeads
     distance_unit: float  # world units, of the view embedding
     background: tuple[float, float, float]  # RGB, 0 to 1
-    appearance_dtype: torch.dtype = (
-        torch.float32
-    )  # in which opacity and color are computed; bfloat16: for GPUs
-    world_offset: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # world units, float64: origin of the local frame
+    # in which the networks of opacity and color compute; bfloat16: for GPUs
+    appearance_dtype: torch.dtype = torch.float32
+    # world units, float64: origin of the local frame
+    world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     viewpoints: tuple[Camera, ...] = ()  # of the world: where to look from, the best first
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # direction of the sky
 
@@ -180,8 +176,8 @@ class HybridModel:
         # The anchors' ranges of coupled primitives, one after the other.
         coupled = torch.arange(len(rows), device=rows.device)
         coupled += (first + counts - counts.cumsum(0)).index_select(0, rows)
-        view = view_embedding(p.positions.index_select(0, anchors), center, self.distance_unit)
-        seen = torch.cat([p.references.index_select(0, anchors), view], 1)
+        references, positions = (t.index_select(0, anchors) for t in (p.references, p.positions))
+        seen = see(references, positions, center, self.distance_unit)
         residuals = p.residuals.index_select(0, coupled)
         found = predict_appearance(
             self.heads, seen, residuals, rows, dtype=self.appearance_dtype, compact=choosing_pays(rows.device)

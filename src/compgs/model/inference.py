@@ -46,7 +46,7 @@ class DrawnArrays:
 
 @dataclass(frozen=True, eq=False)
 class SceneArrays:
-    """A scene whose geometry is known."""
+    """A scene whose geometry is known: all that a view needs, but for the networks."""
 
     primitives: PrimitiveArrays
     first_coupled: np.ndarray  # [N + 1] int64: first coupled primitive of each anchor
@@ -90,6 +90,8 @@ class HeadArrays(ABC):
 
 @dataclass(frozen=True, eq=False)
 class PairedArrays(HeadArrays):
+    """Two networks; opacity and color of a view come from one pass of kernels."""
+
     geometry_network: MLPArrays
     appearance_network: MLPArrays
 
@@ -125,6 +127,8 @@ class PairedArrays(HeadArrays):
 
 @dataclass(frozen=True, eq=False)
 class SeparateArrays(HeadArrays):
+    """Four networks; colors are predicted of those that are drawn alone."""
+
     translation_network: MLPArrays
     covariance_network: MLPArrays
     opacity_network: MLPArrays

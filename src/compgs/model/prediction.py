@@ -26,9 +26,6 @@ from compgs.model.primitives import Primitives
 if TYPE_CHECKING:
     from compgs.model.heads import PredictionHeads
 
-# Name, in a file, of the residual embeddings [K, residual_dim] that all anchors share where none has its own.
-SHARED_RESIDUALS = "residuals"
-
 
 @dataclass(frozen=True)
 class Prediction:
@@ -58,6 +55,16 @@ def view_embedding(
     offset = positions - camera_center
     distance = offset.norm(dim=1, keepdim=True)
     return torch.cat([offset / distance.clamp_min(SMALLEST_DISTANCE), distance / distance_unit], 1)
+
+
+def see(
+    references: Tensor,  # [N, reference_dim] of anchors
+    positions: Tensor,  # [N, 3] of the same, world units
+    camera_center: Tensor,  # [3] world units
+    distance_unit: float,  # world units
+) -> Tensor:  # [N, reference_dim + 4]
+    """What the networks of opacity and color take of an anchor: reference embedding, then view embedding."""
+    return torch.cat([references, view_embedding(positions, camera_center, distance_unit)], 1)
 
 
 def opacity_activation(raw: Tensor) -> Tensor:
@@ -111,8 +118,7 @@ def predict(
     primitives, those that are not drawn with opacity 0; the same image and gradients by more arithmetic, but a GPU need
     not be waited for to learn how many there are. `appearance_dtype`: of the networks of opacity and color.
     """
-    view = view_embedding(primitives.positions, camera_center, distance_unit)
-    seen = torch.cat([primitives.references, view], 1)
+    seen = see(primitives.references, primitives.positions, camera_center, distance_unit)
     function = _drawn if compact else _all
     if weights is None:
         return function(heads, primitives, seen, appearance_dtype)
@@ -124,12 +130,14 @@ def predict(
 def _drawn(
     heads: "PredictionHeads", primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype
 ) -> Prediction:
+    """What is drawn, by the fastest means that the heads have."""
     return heads.predict_drawn(primitives, seen, appearance_dtype)
 
 
 def _all(
     heads: "PredictionHeads", primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype
 ) -> Prediction:
+    """All, drawn or not."""
     return predict_by_torch(heads, primitives, seen, appearance_dtype, compact=False)
 
 
@@ -141,7 +149,7 @@ def predict_by_torch(
     *,
     compact: bool = True,
 ) -> Prediction:
-    """`predict` by the heads as they are, in plain torch."""
+    """`predict` by the heads as they are, in plain torch (the networks alone run in kernels where they can)."""
     p = primitives
     a = predict_appearance(heads, seen, p.residuals, p.anchor_index, dtype=appearance_dtype, compact=compact)
     means, scales, quaternions = predict_geometry(heads, p, a.residuals, a.anchor)
@@ -154,7 +162,7 @@ def predict_by_torch(
 
 @dataclass(frozen=True)
 class Appearance:
-    """Opacity and color of M of P coupled primitives, and what else is predicted of them from."""
+    """Opacity and color of M of P coupled primitives, and the inputs from which their geometry is predicted."""
 
     all_opacities: Tensor  # [P]
     index: Tensor | None  # [M] int64, ascending: those that are drawn; None: all
@@ -171,8 +179,9 @@ def predict_appearance(
     anchor_index: Tensor,  # [P] int64, ascending: rows of `seen`
     *,
     dtype: torch.dtype,  # in which the networks compute
-    compact: bool,  # those that are drawn alone; else all: no value decides a shape
+    compact: bool,
 ) -> Appearance:
+    """Opacity of all, color of those that are drawn; not `compact`: color of all, and no value decides a shape."""
     with appearance_precision(residuals.device, dtype):
         raw = heads.raw_appearance(seen, residuals, anchor_index).to(residuals.dtype)
     opacities = all_opacities = opacity_activation(raw)

@@ -18,9 +18,7 @@ class Primitives:
     """
 
     positions: Tensor  # [N, 3] world units
-    log_scales: (
-        Tensor  # [N, 6] natural log of (0:3) reach of the offsets, (3:6) size of the primitives, in voxels
-    )
+    log_scales: Tensor  # [N, 6] natural log of (0:3) reach of a translation, (3:6) size, in voxels
     references: Tensor  # [N, reference_dim]
     residuals: Tensor  # [P, residual_dim], P coupled primitives
     anchor_index: Tensor  # [P] int64, ascending: row of the anchor of each coupled primitive

@@ -75,11 +75,8 @@ class SplatModel:
 
     splats: Splats
     background: tuple[float, float, float]  # RGB, 0 to 1
-    world_offset: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # world units, float64: origin of the local frame
+    # world units, float64: origin of the local frame
+    world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @functools.cached_property
     def bounds(self) -> tuple[Tensor, Tensor]:
