@@ -48,11 +48,11 @@ ALLOWED = {
     "metrics": BASE | {"ssim"},
     "trained_model": BASE | {"model", "entropy"},
     "codec": BASE | {"model", "entropy", "trained_model"},
-    "export": BASE | {"model"},
+    "formats": BASE | {"model", "render", "codec"},
     "training": BASE | {"scene", "render", "model", "entropy", "ssim", "losses", "metrics", "trained_model"},
-    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "export"},
+    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
     "cli": BASE
-    | {"scene", "render", "model", "metrics", "codec", "export", "training", "evaluation", "trained_model"},
+    | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation", "trained_model"},
     "__main__": BASE | {"cli"},
 }
 

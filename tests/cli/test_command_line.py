@@ -226,7 +226,7 @@ def test_wrong_input_is_one_clear_line_and_nothing_is_written(
     (tmp_path / "full" / "run.cgs").write_bytes(b"precious")
     (tmp_path / "file").write_bytes(b"something else")
     (tmp_path / "nothing").touch()
-    (tmp_path / "splats.ply").write_bytes(b"ply")
+    (tmp_path / "splats.ply").write_bytes(b"ply\n")
     (tmp_path / "GOLDEN").write_bytes(GOLDEN_FILE.read_bytes())
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
