@@ -117,8 +117,8 @@ def _harmonics(arrays: SplatArrays, meta: dict[str, Any]) -> dict[str, bytes]:
 
 
 def palette_size(count: int) -> int:
-    """Entries for so many splats: a quarter of them, as far as 16 bits go. Fewer save little and cost quality."""
-    return min(MOST_ENTRIES, max(count // 4, min(count, 1024)))
+    """Entries for so many splats: half of them, as far as 16 bits go. Fewer save little and cost quality."""
+    return min(MOST_ENTRIES, max(count // 2, 1024))
 
 
 def morton_order(means: np.ndarray) -> np.ndarray:
