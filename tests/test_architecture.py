@@ -28,6 +28,7 @@ ALLOWED = {
         "codec",
         "render",
         "evaluation",
+        "exporting",
     },
     "errors": set(),
     "interrupt": set(),
@@ -51,8 +52,10 @@ ALLOWED = {
     "formats": BASE | {"model", "render", "codec"},
     "training": BASE | {"scene", "render", "model", "entropy", "ssim", "losses", "metrics", "trained_model"},
     "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
+    "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation"},
     "cli": BASE
-    | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation", "trained_model"},
+    | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
+    | {"trained_model", "exporting"},
     "__main__": BASE | {"cli"},
 }
 
