@@ -118,40 +118,40 @@ class Limits:
     """What the splats may cost."""
 
     degree: int  # of the harmonics
-    splats: int | None
-    bytes: int | None
+    most_splats: int | None
+    most_bytes: int | None  # of the file
 
     def check(self, refine: int) -> None:
         """Raises ConfigError for what cannot be."""
         for name, value, low, high in (
             ("degree", self.degree, 0, MAX_DEGREE),
             ("refine", refine, 0, MOST_STEPS),
-            ("max_splats", self.splats, 1, None),
-            ("max_bytes", self.bytes, 1, None),
+            ("max_splats", self.most_splats, 1, None),
+            ("max_bytes", self.most_bytes, 1, None),
         ):
             if value is not None and (value < low or (high is not None and value > high)):
                 raise ConfigError(f"{name} = {value}: expected {low} to {high or 'any number'}")
 
     def change(self, model: Renderable) -> bool:
         """Whether a scene's splats cannot stay as they are."""
-        fewer = self.splats is not None or self.bytes is not None
+        fewer = self.most_splats is not None or self.most_bytes is not None
         return fewer or not isinstance(model, SplatModel) or self.degree < model.splats.degree
 
     def keep(self, baked: Baked, write: Callable[[Baked], bytes]) -> Baked:
         """The most important splats, as many as may be. Raises ConfigError if the bytes are too few for any."""
-        if self.splats is not None:
-            baked = baked.most_important(self.splats)
-        if self.bytes is None:
+        if self.most_splats is not None:
+            baked = baked.most_important(self.most_splats)
+        if self.most_bytes is None:
             return baked
         for _ in range(BUDGET_ROUNDS):
             size = len(write(baked))
-            if size <= self.bytes:
+            if size <= self.most_bytes:
                 return baked
-            fewer = int(len(baked.importance) * BUDGET_MARGIN * self.bytes / size)
+            fewer = int(len(baked.importance) * BUDGET_MARGIN * self.most_bytes / size)
             if fewer < 1:
                 break
             baked = baked.most_important(fewer)
-        raise ConfigError(f"max_bytes = {self.bytes}: too few for any splat, expected {size} or more")
+        raise ConfigError(f"max_bytes = {self.most_bytes}: too few for any splat, expected {size} or more")
 
 
 def own_cameras(model: Renderable) -> list[Camera]:
