@@ -18,7 +18,7 @@ import torch
 
 from compgs import metrics
 from compgs.cameras import Camera
-from compgs.errors import ConfigError, MissingDependency, OutputError
+from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import between, surround
 from compgs.evaluation.importance import splat_importance
 from compgs.formats import WRITERS, SplatArrays, arrays_of, encoded, format_of, open_scene
@@ -32,6 +32,7 @@ from compgs.outputs import check_output_file, write_bytes
 from compgs.render import Renderable, render
 
 HTML = "html"
+SAME_PICTURE = 100.0  # dB, about what one level in one pixel of one channel comes to
 FITTED_CAMERAS = 96  # of baking; fewer than the coefficients leave colors between them to chance
 COMPARED_CAMERAS = 12  # between the file's own, beside those: baking saw none of them
 LONGEST_SIDE = 800  # pixels, of cameras that baking looks through
@@ -46,13 +47,14 @@ class Exported:
 
     bytes: int
     splats: int | None  # None: the page holds the scene itself
+    dropped: int  # splats that were left out for the file to be small enough
     psnr: tuple[float, ...]  # dB, 8-bit images, of each camera; infinite where nothing changed
     origin: tuple[float, float, float]  # world units: where positions in the file count from
 
     @property
     def mean(self) -> float:
-        """dB, of the cameras; infinite if all pictures are the same."""
-        return fmean(self.psnr)
+        """dB, of the cameras; equal pictures count as SAME_PICTURE, unless all are."""
+        return self.worst if self.worst == float("inf") else fmean(min(p, SAME_PICTURE) for p in self.psnr)
 
     @property
     def worst(self) -> float:
@@ -102,6 +104,7 @@ def export(
 
     origin = (0.0, 0.0, 0.0) if kind in KEEP_WORLD_OFFSET else model.world_offset
     baked = _splats_of(model, fitted if changed else [], degree, count)
+    before = len(baked.importance)
     baked = limits.keep(baked, lambda b: encoded(_arrays(b, model, kind), kind))
     if changed:
         baked = refine_splats(baked, model, fitted, refine, count)
@@ -110,7 +113,8 @@ def export(
     data = encoded(_arrays(baked, model, kind), kind)
     psnr = tuple(_compared(model, _read_back(data, kind, model), compared, count))
     write_bytes(path, data)
-    return Exported(len(data), len(baked.importance), psnr, origin)
+    kept = len(baked.importance)
+    return Exported(len(data), kept, before - kept, psnr, origin)
 
 
 @dataclass(frozen=True)
@@ -219,10 +223,10 @@ def _counter(total: int, progress: Callable[[int, int], None] | None) -> Callabl
 
 
 def _export_page(source: Path, path: Path) -> Exported:
-    """A web page that holds the file itself, and the decoder. Raises ConfigError, MissingDependency."""
+    """A web page that holds the file itself, and the decoder. Raises BitstreamError, MissingDependency."""
     found = format_of(source)
     if found.name != "cgs":
-        raise ConfigError(f"{source}: a page shows a .cgs file, found a .{found.name}; compress it first")
+        raise NotACompGSFile(f"{source}: a page shows a .cgs file, found a .{found.name}")
     found.check(source)
     try:
         viewer = importlib.import_module("compgs.viewer")
@@ -233,4 +237,4 @@ def _export_page(source: Path, path: Path) -> Exported:
     page = viewer.html_page(source.read_bytes(), source.stem)
     data = page.encode("utf-8") if isinstance(page, str) else page
     write_bytes(path, data)
-    return Exported(len(data), None, (), (0.0, 0.0, 0.0))
+    return Exported(len(data), None, 0, (), (0.0, 0.0, 0.0))

@@ -89,6 +89,11 @@ def report(source: Path, path: Path, exported: "Exported") -> list[str]:
             f"beside {source.name}: {exported.mean:.2f} dB, {exported.worst:.2f} dB from the worst of "
             f"{len(exported.psnr)} cameras"
         )
+    if exported.dropped:
+        total = exported.splats + exported.dropped
+        lines.append(
+            f"{exported.dropped:,} of {total:,} splats were left out; a lower --degree leaves room for more of them"
+        )
     if any(exported.origin):
         place = " ".join(f"{x:g}" for x in exported.origin)
         lines.append(

@@ -66,8 +66,8 @@ POSITION_LIMIT = (1 << 23) - 1  # of 24 bits with a sign
 MOST_FRACTIONAL_BITS = 24
 # Positions are as fine as this part of the median splat: farther digits are noise that costs bytes.
 STEP_OF_SCALE = 1 / 16
-# Kept bits of 8: the others are zero, which compresses. Of a baked scene 7 and 6 are 44 dB from it; 5 and 4, which other
-# programs write, are 38 dB and three quarters of the bytes; 8 and 8 are 46 dB and 1.4 times the bytes.
+# Kept bits of 8: the others are zero, which compresses. Of a baked scene 7 and 6 are 44 dB from it; 5 and 4, which
+# other programs write, are 38 dB and three quarters of the bytes; 8 and 8 are 46 dB and 1.4 times the bytes.
 HARMONIC_BITS = (7, 6)  # of degree 1; of degrees 2 and 3
 _SQRT_HALF = 2**-0.5
 _SMALLEST_THREE_STEPS = 511
