@@ -5,6 +5,7 @@ import heapq
 import numpy as np
 
 ROUNDS = 48  # of moving every number of a codebook to the middle of what is nearest to it
+BINS = 4096  # of the histogram from which a codebook begins
 AXIS_ROUNDS = 3  # of power iteration: the axis need not be exact
 
 
@@ -12,9 +13,10 @@ def codebook(values: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """`size` float32 numbers, ascending, and for each value the index of the nearest (uint8 for 256)."""
     flat = np.sort(values.astype(np.float64).reshape(-1))
     sums = np.concatenate([[0.0], np.cumsum(flat)])
-    # From the middle between equal shares and equal steps: dense regions and far values both get some.
-    shares = flat[np.linspace(0, len(flat) - 1, size).round().astype(np.int64)]
-    centers = (shares + np.linspace(flat[0], flat[-1], size)) / 2
+    # As dense as the third root of the values' density, which is best for many levels (Panter and Dite 1951).
+    counts, edges = np.histogram(flat, BINS)
+    density = np.concatenate([[0.0], np.cumsum(np.cbrt(counts))])
+    centers = np.interp(np.linspace(0, density[-1], size), density, edges)
     for _ in range(ROUNDS):
         edges = np.searchsorted(flat, (centers[1:] + centers[:-1]) / 2)
         first, last = np.append(0, edges), np.append(edges, len(flat))

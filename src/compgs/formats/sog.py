@@ -90,9 +90,9 @@ def _images(arrays: SplatArrays) -> tuple[dict[str, bytes], dict[str, Any]]:
         "count": len(arrays),
         "antialias": False,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": scale_book.tolist(), "files": ["scales.webp"]},
+        "scales": {"codebook": _short(scale_book), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
-        "sh0": {"codebook": color_book.tolist(), "files": ["sh0.webp"]},
+        "sh0": {"codebook": _short(color_book), "files": ["sh0.webp"]},
     }
     if arrays.degree:
         files |= _harmonics(arrays, meta)
@@ -108,12 +108,17 @@ def _harmonics(arrays: SplatArrays, meta: dict[str, Any]) -> dict[str, bytes]:
     pixels = np.zeros((rows * PALETTE_ROW, coefficients, 3), np.uint8)
     pixels[:count] = indices.reshape(count, coefficients, 3)
     names = ["shN_centroids.webp", "shN_labels.webp"]
-    meta["shN"] = {"count": count, "bands": arrays.degree, "codebook": book.tolist(), "files": names}
+    meta["shN"] = {"count": count, "bands": arrays.degree, "codebook": _short(book), "files": names}
     halves = np.column_stack([labels & 255, labels >> 8, np.zeros_like(labels)])
     return {
         names[0]: _webp(pixels.reshape(rows, PALETTE_ROW * coefficients, 3)),
         names[1]: _image(halves),
     }
+
+
+def _short(book: np.ndarray) -> list[float]:
+    """Numbers of seven digits: all that float32 knows, in half the text."""
+    return [float(f"{number:.7g}") for number in book]
 
 
 def palette_size(count: int) -> int:
