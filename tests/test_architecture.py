@@ -27,6 +27,7 @@ ALLOWED = {
         "codec",
         "render",
         "evaluation",
+        "exporting",
     },
     "errors": set(),
     "interrupt": set(),
@@ -45,11 +46,13 @@ ALLOWED = {
     "stored_weights": BASE | {"model", "entropy"},
     "trained_model": BASE | {"model", "entropy", "stored_weights"},
     "codec": BASE | {"model", "entropy", "trained_model"},
-    "export": BASE | {"model"},
+    "formats": BASE | {"model", "render", "codec"},
     "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
-    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "export"},
+    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
+    "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation"},
     "cli": BASE
-    | {"scene", "render", "model", "metrics", "codec", "export", "training", "evaluation", "trained_model"},
+    | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
+    | {"trained_model", "exporting"},
     "__main__": BASE | {"cli"},
 }
 
