@@ -49,10 +49,11 @@ ALLOWED = {
     "formats": BASE | {"model", "render", "codec"},
     "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
     "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
-    "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation"},
+    "viewer": BASE,
+    "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},
     "cli": BASE
     | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting"},
+    | {"trained_model", "exporting", "viewer"},
     "__main__": BASE | {"cli"},
 }
 
