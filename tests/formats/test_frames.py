@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from compgs.rotations import rotation_from_quaternion
 
 from compgs.formats.arrays import Y0, SplatArrays, normalized
 from compgs.formats.frames import (
@@ -13,6 +12,7 @@ from compgs.formats.frames import (
     transformed,
     turned,
 )
+from compgs.numerics.rotations import rotation_from_quaternion
 
 
 def covariances(arrays: SplatArrays) -> np.ndarray:

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from compgs.rotations import rotation_from_quaternion
 
 from compgs.errors import SplatFileError
 from compgs.formats import glb
 from compgs.formats.arrays import SplatArrays, normalized
 from compgs.formats.frames import LEFT_UP_FORWARD, transformed, turned
+from compgs.numerics.rotations import rotation_from_quaternion
 
 PREFIX = "KHR_gaussian_splatting:"
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
-from compgs.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
+from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
 
 MAX_SIDE = 16_384  # pixels
 
