@@ -7,7 +7,8 @@ import torch
 
 from compgs.config import Config, ModelConfig
 from compgs.entropy.quantization import quantize_weight
-from compgs.trained_model import SHARED_RESIDUAL_BITS, OwnResiduals, SharedResiduals, TrainedModel
+from compgs.stored_weights import SHARED_RESIDUAL_BITS
+from compgs.trained_model import OwnResiduals, SharedResiduals, TrainedModel
 
 N, K, G, STEP = 6, 3, 2, 0.5
 
