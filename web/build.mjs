@@ -7,16 +7,40 @@
 import { readFile, writeFile } from "node:fs/promises";
 import { resolve } from "node:path";
 import { fileURLToPath } from "node:url";
+import asc from "assemblyscript/asc";
 import { build } from "esbuild";
 
 const folder = resolve(process.argv[2] ?? "dist");
 process.chdir(fileURLToPath(new URL(".", import.meta.url)));
 
+/** assembly/ as a WebAssembly module. */
+async function compiledKernels() {
+  const flags = ["-O3", "--noAssert", "--runtime", "stub", "--enable", "simd", "--outFile", "kernels.wasm"];
+  let binary;
+  const { error, stderr } = await asc.main(["assembly/index.ts", ...flags], {
+    writeFile(_, contents) {
+      binary = contents;
+    },
+  });
+  if (error) throw new Error(`${error.message}: ${stderr}`);
+  return binary;
+}
+
+const kernels = await compiledKernels();
+const embedKernels = {
+  name: "kernels",
+  setup({ onResolve, onLoad }) {
+    onResolve({ filter: /^compgs:kernels$/ }, () => ({ path: "kernels", namespace: "kernels" }));
+    onLoad({ filter: /.*/, namespace: "kernels" }, () => ({ contents: kernels, loader: "binary" }));
+  },
+};
+
 const shared = {
   bundle: true,
   format: "esm",
   target: "es2022",
-  loader: { ".bin": "binary", ".wasm": "binary" },
+  loader: { ".bin": "binary" },
+  plugins: [embedKernels],
   minify: true,
   legalComments: "none",
   charset: "ascii",
@@ -39,9 +63,9 @@ const embedWorker = {
 };
 
 await build({ ...shared, entryPoints: ["src/index.ts"], outfile: `${folder}/compgs.js` });
-await build({ ...shared, entryPoints: ["viewer/viewer.ts"], outfile: `${folder}/viewer.js`, plugins: [embedWorker] });
+await build({ ...shared, entryPoints: ["viewer/viewer.ts"], outfile: `${folder}/viewer.js`, plugins: [embedKernels, embedWorker] });
 
-const script = await bundled("viewer/page.ts", { plugins: [embedWorker] });
+const script = await bundled("viewer/page.ts", { plugins: [embedKernels, embedWorker] });
 const template = await readFile("viewer/page.html", "utf8");
 // A function, as replacement patterns in the script must stay what they are.
 await writeFile(`${folder}/page.html`, template.replace("{{script}}", () => script.trim()));

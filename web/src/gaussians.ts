@@ -1,6 +1,7 @@
 /** The Gaussians of a scene that a camera sees. */
 
 import { type Camera, cameraCentre } from "./cameras.ts";
+import type { Kernels } from "./codec/kernels.ts";
 import type { Scene } from "./codec/scene_decoder.ts";
 import { OPACITY_CUTOFF, Predictor } from "./prediction/predictor.ts";
 
@@ -21,8 +22,8 @@ export interface Gaussians {
  * What a camera of the world sees, in the order of the file. For many cameras keep a `Predictor`: geometry does not
  * depend on the camera.
  */
-export function gaussians(scene: Scene, camera: Pick<Camera, "worldToCamera">): Gaussians {
-  const predictor = new Predictor(scene);
+export function gaussians(scene: Scene, camera: Pick<Camera, "worldToCamera">, kernels?: Kernels): Gaussians {
+  const predictor = new Predictor(scene, kernels);
   const appearance = predictor.newAppearance();
   const centre = cameraCentre(camera).map((x, axis) => x - scene.worldOffset[axis]!);
   predictor.predictAppearance(centre, appearance);

@@ -3,8 +3,9 @@ declare module "*.bin" {
   const bytes: Uint8Array;
   export default bytes;
 }
-declare module "*.wasm" {
-  const bytes: Uint8Array;
+/** assembly/, compiled by the build. */
+declare module "compgs:kernels" {
+  const bytes: Uint8Array<ArrayBuffer>;
   export default bytes;
 }
 /** The worker's program, bundled by the build. */

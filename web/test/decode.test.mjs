@@ -4,19 +4,38 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { compgs, fixtures, goldenFiles, hashesOf, refusedFiles } from "./fixtures.mjs";
 
-const { decode } = compgs;
+const { decode, plainKernels, wasmKernels } = compgs;
+const KINDS = { "plain TypeScript": plainKernels, WebAssembly: await wasmKernels() };
 
-for (const { name, bytes, hashes } of goldenFiles()) {
-  test(`golden file ${name} decodes to its pinned integers`, () => {
-    assert.deepEqual(hashesOf(decode(bytes)), hashes);
+for (const [kind, kernels] of Object.entries(KINDS)) {
+  for (const { name, bytes, hashes } of goldenFiles()) {
+    test(`${kind}: golden file ${name} decodes to its pinned integers`, () => {
+      assert.deepEqual(hashesOf(decode(bytes, { kernels })), hashes);
+    });
+  }
+
+  for (const { name, bytes, expected } of fixtures()) {
+    test(`${kind}: symbols and latents of ${name} are those of the Python package`, () => {
+      assert.deepEqual(hashesOf(decode(bytes, { kernels })), expected.hashes);
+    });
+  }
+
+  test(`${kind}: damaged files are refused as the Python package refuses them`, () => {
+    const wrong = [];
+    refusedFiles().forEach(({ data, error }, i) => {
+      let found = null;
+      try {
+        decode(Buffer.from(data, "base64"), { kernels });
+      } catch (thrown) {
+        found = thrown.name;
+      }
+      if (found !== error) wrong.push(`case ${i}: ${found}, expected ${error}`);
+    });
+    assert.deepEqual(wrong, []);
   });
 }
 
 for (const { name, bytes, expected } of fixtures()) {
-  test(`${name}: symbols and latents are those of the Python package`, () => {
-    assert.deepEqual(hashesOf(decode(bytes)), expected.hashes);
-  });
-
   test(`${name}: each prefix is the scene that the Python package decodes of it`, () => {
     for (const [length, { stands_for: standsFor, ...hashes }] of Object.entries(expected.prefixes)) {
       const scene = decode(bytes, { prefix: Number(length) });
@@ -54,17 +73,3 @@ function close(found, expected, tolerance) {
   assert.equal(found.length, expected.length);
   expected.forEach((x, i) => assert.ok(Math.abs(found[i] - x) <= tolerance, `${found} is not near ${expected}`));
 }
-
-test("damaged files are refused as the Python package refuses them", () => {
-  const wrong = [];
-  refusedFiles().forEach(({ data, error }, i) => {
-    let found = null;
-    try {
-      decode(Buffer.from(data, "base64"));
-    } catch (thrown) {
-      found = thrown.name;
-    }
-    if (found !== error) wrong.push(`case ${i}: ${found}, expected ${error}`);
-  });
-  assert.deepEqual(wrong, []);
-});

@@ -4,23 +4,26 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { compgs, fixtures } from "./fixtures.mjs";
 
-const { Predictor, decode, gaussians } = compgs;
+const { Predictor, decode, gaussians, plainKernels, wasmKernels } = compgs;
+const KINDS = { "plain TypeScript": plainKernels, WebAssembly: await wasmKernels() };
 
 const FIELDS = { means: 3, quaternions: 4, scales: 3, opacities: 1, colors: 3 };
 
 for (const { name, bytes, expected, arrays } of fixtures()) {
-  test(`${name}: Gaussians are those of the Python package`, () => {
-    const scene = decode(bytes);
-    const found = gaussians(scene, { worldToCamera: expected.world_to_camera });
-    assert.equal(found.opacities.length, expected.gaussians);
-    let at = 0;
-    for (const [field, columns] of Object.entries(FIELDS)) {
-      const size = 4 * columns * expected.gaussians;
-      const truth = new Float32Array(arrays.buffer.slice(arrays.byteOffset + at, arrays.byteOffset + at + size));
-      at += size;
-      assertClose(field, found[field], truth, columns);
-    }
-  });
+  const scene = decode(bytes, { kernels: KINDS.WebAssembly });
+  for (const [kind, kernels] of Object.entries(KINDS)) {
+    test(`${kind}: Gaussians of ${name} are those of the Python package`, () => {
+      const found = gaussians(scene, { worldToCamera: expected.world_to_camera }, kernels);
+      assert.equal(found.opacities.length, expected.gaussians);
+      let at = 0;
+      for (const [field, columns] of Object.entries(FIELDS)) {
+        const size = 4 * columns * expected.gaussians;
+        const truth = new Float32Array(arrays.buffer.slice(arrays.byteOffset + at, arrays.byteOffset + at + size));
+        at += size;
+        assertClose(field, found[field], truth, columns);
+      }
+    });
+  }
 }
 
 /** Twice the tolerance of one, as both may drift; of means, relative to the largest. */
@@ -39,7 +42,7 @@ function assertClose(field, found, truth, columns) {
 test("appearance of some anchors alone is that of all", () => {
   for (const { bytes, name } of fixtures()) {
     if (name !== "paper" && name !== "shared") continue;
-    const predictor = new Predictor(decode(bytes));
+    const predictor = new Predictor(decode(bytes), KINDS.WebAssembly);
     const [whole, part] = [predictor.newAppearance(), predictor.newAppearance()];
     predictor.predictAppearance([1, 2, 3], whole);
     const { anchors, firstCoupled } = predictor.primitives;

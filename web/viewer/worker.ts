@@ -1,5 +1,6 @@
 /** The worker: decodes a file as it arrives, predicts its splats, and sorts them for the camera at hand. */
 
+import type { Kernels } from "../src/codec/kernels.ts";
 import type { Scene } from "../src/codec/scene_decoder.ts";
 import { type Appearance, OPACITY_CUTOFF, Predictor } from "../src/prediction/predictor.ts";
 import { ProgressiveDecoder } from "../src/progressive.ts";
@@ -70,7 +71,8 @@ function streamOf(bytes: Uint8Array): ReadableStream<Uint8Array> {
 
 async function open(ticket: number, stream: ReadableStream<Uint8Array>, total: number | null): Promise<void> {
   try {
-    const decoder = new ProgressiveDecoder(await kernels);
+    const chosen = await kernels;
+    const decoder = new ProgressiveDecoder(chosen);
     const reader = stream.getReader();
     let loaded = 0;
     for (;;) {
@@ -80,7 +82,7 @@ async function open(ticket: number, stream: ReadableStream<Uint8Array>, total: n
       loaded += value.length;
       const isFiner = decoder.push(value);
       self.postMessage({ kind: "progress", loaded, total: total ?? decoder.expectedBytes });
-      if (isFiner) show(decoder.scene());
+      if (isFiner) show(decoder.scene(), chosen);
     }
     decoder.finish();
     self.postMessage({ kind: "complete", bytes: loaded });
@@ -95,8 +97,8 @@ function report(ticket: number, error: unknown): void {
   self.postMessage({ kind: "error", name, message });
 }
 
-function show(scene: Scene): void {
-  const predictor = new Predictor(scene);
+function show(scene: Scene, chosen: Kernels): void {
+  const predictor = new Predictor(scene, chosen);
   shown = {
     predictor,
     appearance: predictor.newAppearance(),

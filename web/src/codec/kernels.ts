@@ -44,4 +44,42 @@ export interface Kernels {
 
   /** Outputs [rows, outputs] of a network for inputs [rows, inputs], Q12. */
   evaluate(network: IntegerNetwork, inputs: Int32Array, rows: number): Int32Array;
+
+  /**
+   * Outputs [P, outputs] of a residual MLP for the coupled primitives of some anchors, in place of the loop of
+   * src/prediction/coupled_mlp.ts. Absent: that loop runs.
+   */
+  runCoupled?(mlp: PackedMLP, task: CoupledTask): Float32Array;
+}
+
+/** A residual MLP whose widths are padded by zeros: hidden ones to a multiple of 16, outputs to one of 4. */
+export interface PackedMLP {
+  width: number;
+  padded: number;
+  outputs: number;
+  blockCount: number;
+  /** Of each block weight1 [width, width], bias1, weight2, bias2. */
+  blocks: Float32Array;
+  /** [width, padded] */
+  outputWeight: Float32Array;
+  /**
+   * What residual embeddings become: [K, width] and [K, padded] of each slot if they are shared, else the weights
+   * [residualDim, width] and [residualDim, padded].
+   */
+  ownEntry: Float32Array;
+  ownSkip: Float32Array;
+}
+
+export interface CoupledTask {
+  anchors: number;
+  /** [anchors, width] and [anchors, padded]: the anchors' part of first layer and skip, biases included. */
+  entries: Float32Array;
+  skips: Float32Array;
+  /** [anchors + 1] from 0 */
+  firstCoupled: Int32Array;
+  /** [P] if residual embeddings are shared */
+  slots: Uint8Array | null;
+  /** [P, residualDim] if they are not */
+  residuals: Float32Array | null;
+  residualDim: number;
 }

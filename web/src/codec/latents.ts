@@ -9,8 +9,8 @@ import { readStream } from "./streams.ts";
 import { type FrequencyTables, gaussianTables } from "./tables.ts";
 
 const ONE = 1 << FRACTION_BITS;
-/** Rows of a network's outputs that are in memory at a time. */
-const ROWS = 8192;
+/** A network's outputs that are in memory at a time. */
+const OUTPUTS = 1 << 18;
 
 export interface RangeHead {
   level: number;
@@ -93,9 +93,10 @@ function readByNetwork(
   const count = symbolCount(group, anchors);
   const choices = new Uint8Array(count);
   const means = new Int32Array(count);
+  const most = Math.max(1, Math.floor(OUTPUTS / network.outputs));
   let at = 0;
-  for (let first = 0; first < anchors.count; first += ROWS) {
-    const rows = Math.min(ROWS, anchors.count - first);
+  for (let first = 0; first < anchors.count; first += most) {
+    const rows = Math.min(most, anchors.count - first);
     const outputs = kernels.evaluate(network, networkInputs(group, network, anchors, before, first, rows), rows);
     forEachSymbol(group, anchors, first, rows, (row, column) => {
       const place = row * network.outputs + column;

@@ -5,6 +5,7 @@
  * and what they make of a shared residual embedding the same for all anchors: both are computed once.
  */
 
+import type { Kernels, PackedMLP } from "../codec/kernels.ts";
 import type { HeadNetwork } from "./head_networks.ts";
 import type { CoupledPrimitives } from "./scene_values.ts";
 
@@ -26,9 +27,12 @@ export class CoupledMLP {
   private readonly viewRow: number;
   private readonly residualRow: number;
 
+  private readonly packed: PackedMLP | null;
+
   constructor(
     readonly network: HeadNetwork,
     private readonly primitives: CoupledPrimitives,
+    private readonly kernels: Kernels,
   ) {
     const { referenceDim, residualDim, anchors } = primitives;
     this.viewRow = referenceDim;
@@ -40,6 +44,68 @@ export class CoupledMLP {
     };
     const shared = primitives.sharedResiduals;
     this.ofSlots = shared && this.partOfResiduals(shared);
+    this.packed = kernels.runCoupled ? this.pack() : null;
+  }
+
+  private pack(): PackedMLP {
+    const { width, outputs, blocks, outputWeight, inputWeight, skipWeight } = this.network;
+    const { residualDim } = this.primitives;
+    const [wide, padded] = [roundedUp(width, 16), roundedUp(outputs, 4)];
+    const parts = blocks.flatMap(({ weight1, bias1, weight2, bias2 }) => [
+      paddedRows(weight1, width, wide, wide),
+      paddedRows(bias1, width, 1, wide),
+      paddedRows(weight2, width, wide, wide),
+      paddedRows(bias2, width, 1, wide),
+    ]);
+    const all = new Float32Array(parts.reduce((sum, part) => sum + part.length, 0));
+    let at = 0;
+    for (const part of parts) {
+      all.set(part, at);
+      at += part.length;
+    }
+    const entry = this.ofSlots?.entry ?? inputWeight.subarray(this.residualRow * width);
+    const skip = this.ofSlots?.skip ?? skipWeight.subarray(this.residualRow * outputs);
+    const rows = this.ofSlots?.rows ?? residualDim;
+    return {
+      width: wide,
+      padded,
+      outputs,
+      blockCount: blocks.length,
+      blocks: all,
+      outputWeight: paddedRows(outputWeight, outputs, wide, padded),
+      ownEntry: paddedRows(entry, width, rows, wide),
+      ownSkip: paddedRows(skip, outputs, rows, padded),
+    };
+  }
+
+  /** `run` by a kernel: the anchors' parts, the view's included, are made here. */
+  private runPacked(mlp: PackedMLP, first: number, end: number, views: Float32Array | null, out: Float32Array): void {
+    const { firstCoupled, slots, residuals, residualDim } = this.primitives;
+    const { width, outputs, inputWeight, skipWeight } = this.network;
+    const anchors = end - first;
+    const entries = new Float32Array(anchors * mlp.width);
+    const skips = new Float32Array(anchors * mlp.padded);
+    const sums = new Float64Array(Math.max(width, outputs));
+    const fill = (to: Float32Array, stride: number, from: Float32Array, columns: number, weight: Float32Array): void => {
+      for (let n = 0; n < anchors; n++) {
+        for (let j = 0; j < columns; j++) sums[j] = from[(first + n) * columns + j]!;
+        if (views) addProduct(views, 4 * (first + n), 4, weight, this.viewRow, columns, sums);
+        for (let j = 0; j < columns; j++) to[n * stride + j] = sums[j]!;
+      }
+    };
+    fill(entries, mlp.width, this.ofAnchors.entry, width, inputWeight);
+    fill(skips, mlp.padded, this.ofAnchors.skip, outputs, skipWeight);
+    const [from, to] = [firstCoupled[first]!, firstCoupled[end]!];
+    const found = this.kernels.runCoupled!(mlp, {
+      anchors,
+      entries,
+      skips,
+      firstCoupled: firstCoupled.subarray(first, end + 1).map((p) => p - from),
+      slots: this.ofSlots && slots.subarray(from, to),
+      residuals: residuals && residuals.subarray(from * residualDim, to * residualDim),
+      residualDim,
+    });
+    out.set(found, from * outputs);
   }
 
   private partOfResiduals(residuals: Float32Array): Partial {
@@ -57,6 +123,7 @@ export class CoupledMLP {
    * `views` [N, 4]: the view embeddings, for networks that see the view.
    */
   run(first: number, end: number, views: Float32Array | null, out: Float32Array): void {
+    if (this.packed) return this.runPacked(this.packed, first, end, views, out);
     const { firstCoupled, slots, residuals, residualDim } = this.primitives;
     const { width, outputs, inputWeight, skipWeight } = this.network;
     const entry = new Float64Array(width);
@@ -100,6 +167,19 @@ export class CoupledMLP {
       for (let j = 0; j < width; j++) state[j]! += bias2[j]!;
     }
   }
+}
+
+function roundedUp(count: number, unit: number): number {
+  return Math.ceil(count / unit) * unit;
+}
+
+/** Rows of `columns` numbers as `rows` rows of `width`, zeros where there is nothing. */
+function paddedRows(values: Float32Array, columns: number, rows: number, width: number): Float32Array {
+  const result = new Float32Array(rows * width);
+  for (let row = 0; row < Math.min(rows, values.length / columns); row++) {
+    result.set(values.subarray(row * columns, (row + 1) * columns), row * width);
+  }
+  return result;
 }
 
 function leaky(x: number): number {

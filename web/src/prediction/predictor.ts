@@ -1,5 +1,7 @@
 /** From a scene to the Gaussians that a camera sees (docs/bitstream_prediction.md). */
 
+import type { Kernels } from "../codec/kernels.ts";
+import { plainKernels } from "../codec/plain_kernels.ts";
 import type { Scene } from "../codec/scene_decoder.ts";
 import { CoupledMLP } from "./coupled_mlp.ts";
 import { readHeadNetworks } from "./head_networks.ts";
@@ -41,15 +43,18 @@ export class Predictor {
   private readonly views: Float32Array;
   private readonly raw: Float32Array[];
 
-  constructor(private readonly scene: Scene) {
+  constructor(
+    private readonly scene: Scene,
+    kernels: Kernels = plainKernels,
+  ) {
     const { networks, sharedResiduals } = readHeadNetworks(scene);
     this.primitives = coupledPrimitives(scene, sharedResiduals);
     this.positions = Float32Array.from(scene.coordinates, (c) => c * scene.voxelSize);
     const names = scene.heads === "paired" ? ["geometry"] : ["translation", "covariance"];
-    const geometryParts = names.map((name) => new CoupledMLP(networks[name]!, this.primitives));
+    const geometryParts = names.map((name) => new CoupledMLP(networks[name]!, this.primitives, kernels));
     this.geometry = predictGeometry(scene, this.primitives, this.positions, geometryParts);
     const seen = scene.heads === "paired" ? ["appearance"] : ["opacity", "color"];
-    this.appearanceParts = seen.map((name) => new CoupledMLP(networks[name]!, this.primitives));
+    this.appearanceParts = seen.map((name) => new CoupledMLP(networks[name]!, this.primitives, kernels));
     this.views = new Float32Array(4 * scene.anchors);
     this.raw = this.appearanceParts.map((part) => new Float32Array(scene.coupled * part.network.outputs));
   }
