@@ -13,7 +13,7 @@ from compgs.config import Config, EntropyConfig, ModelConfig
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import CorruptSection, NotEncodable, OutputError, TruncatedSection
-from compgs.model.prediction import SHARED_RESIDUALS
+from compgs.model.constants import SHARED_RESIDUALS
 from compgs.trained_model import SHARED_RESIDUAL_BITS, TrainedModel
 
 OWN_RESIDUALS = Config(model=ModelConfig(residuals=True))
