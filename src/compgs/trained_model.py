@@ -12,16 +12,12 @@ from torch import Tensor, nn
 from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.entropy.models import EntropyModel, Quantized, starting_residuals
-from compgs.entropy.quantization import quantize_weight
+from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.heads import HeadDimensions, make_heads
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.primitives import Primitives, every_slot
 from compgs.numerics.linear import Reader
-
-# Biases are few: they keep more bits than the weights.
-BIAS_BITS = 14
-# Residual embeddings that all anchors share are few, too.
-SHARED_RESIDUAL_BITS = 10
+from compgs.stored_weights import StoredWeights
 
 
 class OwnResiduals:
@@ -37,15 +33,22 @@ class OwnResiduals:
         """[V, K * residual_dim] of the anchors in `rows` [V] int64 (None: of all), before they are quantized."""
         return residuals if rows is None else residuals.index_select(0, rows)
 
+    def head_tensors(self, residuals: Tensor) -> dict[str, Tensor]:
+        """None of them is in the file's section of prediction heads: they are latents."""
+        return {}
+
 
 class SharedResiduals:
     """All anchors share K residual embeddings: the parameter has one row, which the file holds beside the heads."""
 
     anchor_parameters = ()
 
-    def __init__(self, coupled_primitives: int, residual_dim: int, step: float) -> None:
+    def __init__(
+        self, coupled_primitives: int, residual_dim: int, step: float, weights: StoredWeights
+    ) -> None:
         self.shape = coupled_primitives, residual_dim
         self.step = step
+        self.weights = weights
 
     def start(self, row: Tensor, anchors: int) -> Tensor:
         """[1, K * residual_dim]: the `row` [K * residual_dim] itself."""
@@ -55,9 +58,12 @@ class SharedResiduals:
         """[1, K * residual_dim] for whichever anchors; `stored`: as the file will hold them, straight-through."""
         if not stored:
             return residuals
-        return (
-            quantize_weight(self.dequantized(residuals), SHARED_RESIDUAL_BITS).view_as(residuals) / self.step
-        )
+        rounded = self.weights.rounded(SHARED_RESIDUALS, self.dequantized(residuals))
+        return rounded.view_as(residuals) / self.step
+
+    def head_tensors(self, residuals: Tensor) -> dict[str, Tensor]:
+        """What they add to the file's section of prediction heads, by name, before it is rounded."""
+        return {SHARED_RESIDUALS: self.dequantized(residuals)}
 
     def dequantized(self, residuals: Tensor) -> Tensor:
         """[K, residual_dim] as prediction sees them, from the parameter [1, K * residual_dim], which is in steps."""
@@ -106,7 +112,9 @@ class TrainedModel(nn.Module):
         self.residual_kind: OwnResiduals | SharedResiduals = (
             OwnResiduals()
             if m.residuals
-            else SharedResiduals(m.coupled_primitives, m.residual_dim, config.entropy.residual_step)
+            else SharedResiduals(
+                m.coupled_primitives, m.residual_dim, config.entropy.residual_step, self.weights
+            )
         )
         # [N, K * residual_dim] steps, or [1, K * residual_dim] where all anchors share them
         self.residuals = nn.Parameter(self.residual_kind.start(starting_residuals(self.entropy, m), n))
@@ -144,6 +152,15 @@ class TrainedModel(nn.Module):
         assert isinstance(self.residual_kind, SharedResiduals)
         return self.residual_kind.dequantized(self.residuals)
 
+    @property
+    def weights(self) -> StoredWeights:
+        """How exactly the file will hold the networks' weights."""
+        return StoredWeights.of(self.config.entropy)
+
+    def head_tensors(self) -> dict[str, Tensor]:
+        """What the file's section of prediction heads holds, by name, before it is rounded."""
+        return {**dict(self.heads.named_parameters()), **self.residual_kind.head_tensors(self.residuals)}
+
     def quantized(
         self,
         rows: Tensor | None = None,  # [V] int64: anchors to look at; default all
@@ -171,7 +188,7 @@ class TrainedModel(nn.Module):
             residuals,
             rate=rate,
             noise=noise,
-            network_bits=e.network_bits if stored_weights else None,
+            network_bits=self.weights.network if stored_weights else None,
             mask=chosen(self.mask) if masked else None,
         )
         if e.quantized:
@@ -193,11 +210,7 @@ class TrainedModel(nn.Module):
 
     def stored_head_weights(self) -> dict[str, Tensor]:
         """The heads' parameters as the file will hold them, by name, straight-through."""
-        bits = self.config.entropy.head_bits
-        return {
-            name: quantize_weight(p, bits if p.dim() > 1 else BIAS_BITS)
-            for name, p in self.heads.named_parameters()
-        }
+        return {name: self.weights.rounded(name, p) for name, p in self.heads.named_parameters()}
 
     @torch.no_grad()
     def as_hybrid_model(self, *, stored_weights: bool = True) -> HybridModel:

@@ -9,8 +9,8 @@ from compgs.cli.inputs import named, read_bitstream
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Command, FileArgument):
-    """Show what is in a .cgs file: bytes, bits per anchor and per coupled primitive of every component; and after how
-    many bytes it can be shown coarsely: with the anchors up to a level of the octree.
+    """Show what is in a .cgs file: bytes of every component, and bits per anchor and per coupled primitive. Then which
+    beginnings of the file are scenes: after how many bytes the anchors up to each octree level are there.
 
     Example
 

@@ -59,7 +59,7 @@ class SectionInfo:
 
 @dataclass(frozen=True)
 class RangeInfo:
-    """A beginning of the file that is a scene."""
+    """A prefix of the file that is a scene, and where it ends."""
 
     level: int  # of the octree
     anchors: int  # up to this level

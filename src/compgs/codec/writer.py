@@ -175,8 +175,8 @@ def _reordered(content: FileContent, order: np.ndarray) -> FileContent:
 
 
 def _padding(content: FileContent, before: list[Section], ranges: list[Section]) -> int:
-    """Zero bytes to add before the ranges of a file that says more than its size allows, itself or its beginning up to
-    the end of a range.
+    """Number of zero bytes to add before the ranges, so that the file, and its beginning up to the end of each range,
+    is long enough for its content (`codec/limits.py`).
     """
     size = container_bytes(len(before) + len(ranges)) + sum(len(section.data) for section in before)
     anchors = padding = 0

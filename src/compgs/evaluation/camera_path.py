@@ -137,7 +137,7 @@ def orbit(
 def surround(positions: np.ndarray, *, width: int = 320, height: int = 240) -> list[tuple[str, Camera]]:
     """72 cameras that see a scene as visitors would: three heights, near and far, all around; positions as in `orbit`.
 
-    For judging what matters in a scene of which nothing but the file is there.
+    Used to judge what matters in a scene when there are no photographs, only the file.
     """
     return [
         (f"{name}, {elevation:.0f} degrees high, {distance} radii away", camera)
