@@ -54,7 +54,7 @@ def made(name: str, *, own_residuals: bool, anchors: int = 60) -> Content:
     """Made-up content; some anchors have no coupled primitive at all."""
     d = dimensions(name, own_residuals=own_residuals)
     content, latents = read_latents(write_content(make_content(anchors, 5, d, kept=0.4)))
-    heads = make_heads(np.random.default_rng(7), d)
+    heads = make_heads(np.random.default_rng(10), d)
     assert not content.mask.any(1).all()
     return plain_content(replace(content, heads=heads), latents)
 
