@@ -149,7 +149,15 @@ def test_from_bytes_to_symbols_no_torch_is_loaded(module: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["constants", "arrays", "residual_mlp_kernels", "prediction_kernels", "inference"]
+    "module",
+    [
+        "constants",
+        "arrays",
+        "residual_mlp_kernels",
+        "prediction_kernels",
+        "spherical_harmonics_kernels",
+        "inference",
+    ],
 )
 def test_from_arrays_to_gaussians_no_torch_is_loaded(module: str) -> None:
     loaded = modules_after(f"import compgs.model.{module}")

@@ -53,3 +53,13 @@ def test_shared_residuals_have_one_row_that_every_anchor_sees_as_the_file_holds_
 
 def test_the_parameters_of_both_kinds_have_the_name_that_checkpoints_hold() -> None:
     assert all("residuals" in dict(made(own=own).named_parameters()) for own in (True, False))
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_the_heads_section_holds_residuals_only_where_all_anchors_share_them(own: bool) -> None:
+    model = made(own=own)
+    networks = dict(model.heads.named_parameters())
+    tensors = model.head_tensors()
+    assert tensors.keys() - networks.keys() == (set() if own else {"residuals"})
+    if not own:
+        assert torch.equal(tensors["residuals"], model.shared_residuals())

@@ -33,6 +33,10 @@ class OwnResiduals:
         """[V, K * residual_dim] of the anchors in `rows` [V] int64 (None: of all), before they are quantized."""
         return residuals if rows is None else residuals.index_select(0, rows)
 
+    def head_tensors(self, residuals: Tensor) -> dict[str, Tensor]:
+        """None of them is in the file's section of prediction heads: they are latents."""
+        return {}
+
 
 class SharedResiduals:
     """All anchors share K residual embeddings: the parameter has one row, which the file holds beside the heads."""
@@ -56,6 +60,10 @@ class SharedResiduals:
             return residuals
         rounded = self.weights.rounded(SHARED_RESIDUALS, self.dequantized(residuals))
         return rounded.view_as(residuals) / self.step
+
+    def head_tensors(self, residuals: Tensor) -> dict[str, Tensor]:
+        """What they add to the file's section of prediction heads, by name, before it is rounded."""
+        return {SHARED_RESIDUALS: self.dequantized(residuals)}
 
     def dequantized(self, residuals: Tensor) -> Tensor:
         """[K, residual_dim] as prediction sees them, from the parameter [1, K * residual_dim], which is in steps."""
@@ -151,8 +159,7 @@ class TrainedModel(nn.Module):
 
     def head_tensors(self) -> dict[str, Tensor]:
         """What the file's section of prediction heads holds, by name, before it is rounded."""
-        shared = {} if self.config.model.residuals else {SHARED_RESIDUALS: self.shared_residuals()}
-        return {**dict(self.heads.named_parameters()), **shared}
+        return {**dict(self.heads.named_parameters()), **self.residual_kind.head_tensors(self.residuals)}
 
     def quantized(
         self,

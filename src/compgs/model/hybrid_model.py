@@ -11,7 +11,7 @@ from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.model.constants import CUTOFF_SIGMAS
 from compgs.model.heads import PredictionHeads
-from compgs.model.inference import DrawnArrays, GeometryArrays, HeadArrays, SceneArrays
+from compgs.model.inference import DrawnArrays, SceneArrays
 from compgs.model.prediction import (
     camera_center,
     choosing_pays,
@@ -89,7 +89,7 @@ class HybridModel:
     def geometry(self) -> tuple[Tensor, Tensor, Tensor]:
         """Means, scales [P, 3] and quaternions [P, 4] of all coupled primitives, world units."""
         if self._in_kernels:
-            g = self._head_arrays.geometry(self.primitives.arrays(), self.first_coupled.numpy())
+            g = self._scene.geometry
             return torch.from_numpy(g.means), torch.from_numpy(g.scales), torch.from_numpy(g.quaternions)
         p = self.primitives
         means, scales, quaternions = (p.positions.new_empty(self.coupled, size) for size in (3, 3, 4))
@@ -126,14 +126,14 @@ class HybridModel:
             return
         chosen, center = self._seen_from(camera, visible)
         for anchors in chosen.split(FRAME_BLOCK):
-            yield _as_gaussians(self._drawn_by_kernels(anchors, center))
+            yield _as_gaussians(self._scene.drawn(anchors.numpy(), center.numpy()))
 
     @torch.no_grad()
     def drawn(self, camera: Camera, visible: Tensor | None = None) -> tuple[Gaussians, Tensor]:
         """What a camera sees (M Gaussians), and which coupled primitives they are ([M] int64, ascending)."""
         chosen, center = self._seen_from(camera, visible)
         if self._in_kernels:
-            drawn = self._drawn_by_kernels(chosen, center)
+            drawn = self._scene.drawn(chosen.numpy(), center.numpy())
             return _as_gaussians(drawn), torch.from_numpy(drawn.index)
         blocks = chosen.split(GPU_BLOCK if chosen.is_cuda else BLOCK)
         parts = [self._appearance(anchors, center) for anchors in blocks]
@@ -156,21 +156,9 @@ class HybridModel:
         return runs_in_kernels(p.residuals.device, p.residuals.dtype, self.appearance_dtype)
 
     @functools.cached_property
-    def _head_arrays(self) -> HeadArrays:
-        return self.heads.arrays()
-
-    @functools.cached_property
-    def _scene_arrays(self) -> SceneArrays:
-        geometry = GeometryArrays(*(array.numpy() for array in self.geometry))
-        first = self.first_coupled.numpy()
-        return SceneArrays(self.primitives.arrays(), first, geometry, self.distance_unit)
-
-    def _drawn_by_kernels(
-        self,
-        anchors: Tensor,  # [V] int64, ascending
-        center: Tensor,  # [3] of the camera, world units
-    ) -> DrawnArrays:
-        return self._head_arrays.drawn(self._scene_arrays, anchors.numpy(), center.numpy())
+    def _scene(self) -> SceneArrays:
+        """The same scene for the kernels."""
+        return SceneArrays.of(self.heads.arrays(), self.primitives.arrays(), self.distance_unit)
 
     def _appearance(
         self,

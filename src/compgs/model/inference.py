@@ -46,12 +46,27 @@ class DrawnArrays:
 
 @dataclass(frozen=True, eq=False)
 class SceneArrays:
-    """A scene whose geometry is known: all that a view needs, but for the networks."""
+    """A scene whose geometry is known: all that a view needs."""
 
+    heads: "HeadArrays"
     primitives: PrimitiveArrays
     first_coupled: np.ndarray  # [N + 1] int64: first coupled primitive of each anchor
     geometry: GeometryArrays
     distance_unit: float  # world units, of the view embedding
+
+    @classmethod
+    def of(cls, heads: "HeadArrays", primitives: PrimitiveArrays, distance_unit: float) -> "SceneArrays":
+        """Predicts the geometry."""
+        first = primitives.first_coupled()
+        return cls(heads, primitives, first, heads.geometry(primitives, first), distance_unit)
+
+    def drawn(
+        self,
+        anchors: np.ndarray,  # [V] int64, ascending: those to look at
+        center: np.ndarray,  # [3] float32 of the camera, world units
+    ) -> DrawnArrays:
+        """What a camera sees of the anchors."""
+        return self.heads.drawn(self, anchors, center)
 
 
 class HeadArrays(ABC):
@@ -62,13 +77,8 @@ class HeadArrays(ABC):
         """[M, 10] translation, scaling, quaternion."""
 
     @abstractmethod
-    def drawn(
-        self,
-        scene: SceneArrays,
-        anchors: np.ndarray,  # [V] int64, ascending: those to look at
-        center: np.ndarray,  # [3] float32 of the camera, world units
-    ) -> DrawnArrays:
-        """What a camera sees of the anchors."""
+    def drawn(self, scene: SceneArrays, anchors: np.ndarray, center: np.ndarray) -> DrawnArrays:
+        """`SceneArrays.drawn` of a scene of these heads."""
 
     def geometry(self, primitives: PrimitiveArrays, first_coupled: np.ndarray) -> GeometryArrays:
         """Of all coupled primitives."""
