@@ -30,7 +30,7 @@ def test_a_title_is_text_even_if_it_looks_like_html() -> None:
 
 def test_a_page_asks_nothing_of_the_network() -> None:
     page = html_page(DATA, "a scene").decode()
-    assert not re.search(r"https?://|<link|<img|@import|\bsrc=", page)
+    assert not re.search(r"""https?://|<img|@import|\bsrc=|href="(?!data:)""", page)
 
 
 def test_a_page_is_smaller_than_400_kilobytes_without_its_scene() -> None:

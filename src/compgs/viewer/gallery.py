@@ -24,6 +24,7 @@ GALLERY = """<!doctype html>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{title}</title>
+<link rel="icon" href="data:,">
 <style>
   :root {{ color-scheme: dark; font: 16px/1.5 system-ui, sans-serif; }}
   body {{ margin: 2rem auto; max-width: 50rem; padding: 0 1rem; background: #111; color: #eee; }}
