@@ -32,7 +32,12 @@ def taken_apart(data: bytes) -> tuple[dict[str, Any], bytes]:
 def put_together(gltf: Any, binary: bytes) -> bytes:
     text = json.dumps(gltf).encode()
     text += b" " * (-len(text) % 4)
-    body = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
+    body = (
+        struct.pack("<II", len(text), 0x4E4F534A)
+        + text
+        + struct.pack("<II", len(binary), 0x004E4942)
+        + binary
+    )
     return b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body
 
 
@@ -67,7 +72,9 @@ def test_the_attributes_are_those_of_the_extension(made, degree: int) -> None:
     np.testing.assert_allclose(
         attribute(gltf, binary, f"{PREFIX}ROTATION"), np.column_stack([-x, -y, z, w]), atol=1e-7
     )
-    np.testing.assert_allclose(attribute(gltf, binary, f"{PREFIX}SCALE"), np.exp(arrays.log_scales), rtol=1e-6)
+    np.testing.assert_allclose(
+        attribute(gltf, binary, f"{PREFIX}SCALE"), np.exp(arrays.log_scales), rtol=1e-6
+    )
     np.testing.assert_allclose(attribute(gltf, binary, f"{PREFIX}OPACITY")[:, 0], arrays.opacities, rtol=1e-6)
     np.testing.assert_array_equal(attribute(gltf, binary, f"{PREFIX}SH_DEGREE_0_COEF_0"), arrays.dc)
     if degree:  # degree 1 is -y, z, -x
@@ -192,7 +199,10 @@ def accessor(gltf: dict[str, Any], name: str) -> dict[str, Any]:
             "colors in other",
         ),
         (edited(lambda g: primitive(g)["attributes"].pop(f"{PREFIX}SCALE")), "SCALE is missing"),
-        (edited(lambda g: primitive(g)["attributes"].pop(f"{PREFIX}SH_DEGREE_2_COEF_1")), "COEF_1 is missing"),
+        (
+            edited(lambda g: primitive(g)["attributes"].pop(f"{PREFIX}SH_DEGREE_2_COEF_1")),
+            "COEF_1 is missing",
+        ),
         (edited(lambda g: primitive(g)["attributes"].update(POSITION="x")), "expected numbers of accessors"),
         (edited(lambda g: primitive(g)["attributes"].update(POSITION=999)), "does not describe splats"),
         (edited(lambda g: accessor(g, "POSITION").update(count=41)), "beyond its part|one number of splats"),
@@ -227,5 +237,5 @@ def test_numbers_that_cannot_be_are_refused(made, tmp_path: Path) -> None:
     arrays: SplatArrays = made(3)
     arrays.means[1, 2] = np.inf
     path.write_bytes(glb.encoded(arrays))
-    with pytest.raises(SplatFileError, match="means of splat 1|not JSON"):
+    with pytest.raises(SplatFileError, match="means of splat 1 hold inf"):
         glb.read(path)

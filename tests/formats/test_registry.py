@@ -84,7 +84,7 @@ def test_zips_and_json_of_other_kinds_are_refused(tmp_path: Path) -> None:
 def test_folders_and_missing_files_are_named_with_a_hint(tmp_path: Path) -> None:
     with pytest.raises(NotACompGSFile, match="there is no such file"):
         format_of(tmp_path / "nowhere.spz")
-    with pytest.raises(NotACompGSFile, match="found a folder$"):
+    with pytest.raises(NotACompGSFile, match=r"found a folder$"):
         format_of(tmp_path)
     (tmp_path / "meta.json").touch()
     with pytest.raises(NotACompGSFile, match=r"did you mean .*meta\.json\?"):

@@ -36,7 +36,12 @@ def by_hand() -> Files:
         "scales": {"codebook": [-4.0, -3.0, -2.0, *book[3:]], "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": [-0.5, 0.0, 1.5, *book[3:]], "files": ["sh0.webp"]},
-        "shN": {"count": 2, "bands": 1, "codebook": [0.0, 0.25, -0.125, *book[3:]], "files": ["c.webp", "l.webp"]},
+        "shN": {
+            "count": 2,
+            "bands": 1,
+            "codebook": [0.0, 0.25, -0.125, *book[3:]],
+            "files": ["c.webp", "l.webp"],
+        },
         "later": "what is not known is ignored",
     }
     centroids = np.zeros((1, 64 * 3, 3), np.uint8)
@@ -118,7 +123,9 @@ def test_the_same_splats_give_the_same_bytes(made) -> None:
     assert sog.encoded(made(50)) == sog.encoded(made(50))
 
 
-def test_a_palette_smaller_than_the_splats_is_used(made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_palette_smaller_than_the_splats_is_used(
+    made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sog, "palette_size", lambda count: 70)
     path = tmp_path / "a.sog"
     arrays = made(400, 1)

@@ -43,7 +43,9 @@ def by_hand(version: int) -> bytes:
     if version < 4:
         return gzip.compress(start + b"".join(columns.values()))
     packed = [zstandard.ZstdCompressor().compress(column) for column in columns.values()]
-    table = b"".join(struct.pack("<QQ", len(p), len(c)) for p, c in zip(packed, columns.values(), strict=True))
+    table = b"".join(
+        struct.pack("<QQ", len(p), len(c)) for p, c in zip(packed, columns.values(), strict=True)
+    )
     return start + struct.pack("<I12x", 32) + table + b"".join(packed)
 
 
@@ -87,7 +89,9 @@ def test_a_round_trip_is_off_by_half_a_step_at_most(made, tmp_path: Path, versio
     np.testing.assert_allclose(again.dc[inside], arrays.dc[inside], atol=0.5001 / 255 / 0.15)
     one, other = normalized(arrays.quaternions), normalized(again.quaternions)
     angles = 2 * np.arccos(np.minimum(np.abs((one * other).sum(1)), 1))
-    assert angles.max() < 0.004  # radians: half a step of 1/511 of sqrt(1/2) in three parts, twice, and the root
+    assert (
+        angles.max() < 0.004
+    )  # radians: half a step of 1/511 of sqrt(1/2) in three parts, twice, and the root
     for columns, bits in ((slice(0, 3), 7), (slice(3, 15), 6)):
         kept = np.abs(arrays.rest[:, columns]) < 0.95
         error = np.abs(again.rest - arrays.rest)[:, columns][kept]
@@ -212,4 +216,6 @@ def test_arrays_are_read_as_they_are_for_a_model(made, tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
     path.write_bytes(spz.encoded(made(3, 2)))
     arrays: SplatArrays = spz.read(path)
-    assert {array.dtype for name, array in vars(arrays).items() if name != "world_offset"} == {np.dtype(np.float32)}
+    assert {array.dtype for name, array in vars(arrays).items() if name != "world_offset"} == {
+        np.dtype(np.float32)
+    }
