@@ -114,6 +114,12 @@ def test_importing_the_package_loads_neither_torch_nor_numba() -> None:
     assert not loaded & {"torch", "numba", "scipy", "PIL"}
 
 
+def test_formats_are_read_and_written_without_torch() -> None:
+    loaded = modules_after("import compgs.formats")
+    assert "compgs.formats.sog" in loaded
+    assert not loaded & {"torch", "numba", "scipy"}
+
+
 def test_the_command_line_starts_without_torch() -> None:
     loaded = modules_after("import compgs.cli.main")
     assert "tyro" in loaded

@@ -159,8 +159,8 @@ class Limits:
 
 
 def own_cameras(model: Renderable) -> list[Camera]:
-    """Of the world: those that the scene was captured with, where its file says so; else all around."""
-    if isinstance(model, HybridModel) and model.viewpoints:
+    """Of the world: those that the scene was captured with, where its file names more than one; else all around."""
+    if isinstance(model, HybridModel) and len(model.viewpoints) > 1:
         return list(model.viewpoints)
     around = surround(model.bounds[0].cpu().numpy())
     return [camera.moved(tuple(-x for x in model.world_offset)) for _, camera in around]

@@ -73,11 +73,11 @@ class Export(ComputingCommand, SceneFileArgument):
                 device=self.device,
                 progress=progress,
             )
-        for line in report(self.file, self.output, exported):
+        for line in report(self.file, self.output, exported, self.degree):
             say(line)
 
 
-def report(source: Path, path: Path, exported: "Exported") -> list[str]:
+def report(source: Path, path: Path, exported: "Exported", degree: int) -> list[str]:
     """What was written, and what it costs, in words."""
     if exported.splats is None:
         return [f"{path}: {size(exported.bytes)}, a page that shows {source.name} without anything else"]
@@ -91,11 +91,10 @@ def report(source: Path, path: Path, exported: "Exported") -> list[str]:
         )
     if exported.dropped:
         total = exported.splats + exported.dropped
-        lines.append(
-            f"{exported.dropped:,} of {total:,} splats were left out; a lower --degree leaves room for more of them"
-        )
+        advice = "; a lower --degree leaves room for more of them" if degree else ""
+        lines.append(f"{exported.dropped:,} of {total:,} splats were left out{advice}")
     if any(exported.origin):
-        place = " ".join(f"{x:g}" for x in exported.origin)
+        place = " ".join(f"{x:.12g}" for x in exported.origin)
         lines.append(
             f"note: positions count from {place}: {path.suffix} has no place for that; .ply and .glb do"
         )
