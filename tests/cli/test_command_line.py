@@ -23,8 +23,10 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
     return code, captured.out, captured.err
 
 
-def test_the_eight_commands_are_there() -> None:
-    assert NAMES == ["train", "encode", "decode", "render", "evaluate", "export", "info", "demo-scene"]
+def test_the_nine_commands_are_there() -> None:
+    assert NAMES == [
+        "train", "encode", "decode", "render", "evaluate", "export", "serve", "info", "demo-scene",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
