@@ -3,6 +3,7 @@
 from typing import Literal
 
 import numpy as np
+from made_heads import make_heads
 
 from compgs.codec.content import (
     LOG_SCALES,
@@ -18,7 +19,6 @@ from compgs.codec.content import (
 )
 from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork
 from compgs.codec.tables import hyper_tables
-from compgs.codec.weights import QuantizedTensor
 
 WEIGHT_SHIFT = 10
 RANDOM_ROWS = 16384
@@ -101,7 +101,7 @@ def make_content(
         coordinates=coordinates,
         mask=mask,
         groups=tuple(groups),
-        heads=_heads(rng, d),
+        heads=make_heads(rng, d),
         metadata={"creator": "made up"},
     )
 
@@ -156,15 +156,4 @@ def _layer(weight: np.ndarray, bias: np.ndarray, *, rectify: bool, adds: bool = 
         shift=WEIGHT_SHIFT,
         rectify=rectify,
         adds=adds,
-    )
-
-
-def _heads(rng: np.random.Generator, d: Dimensions) -> tuple[tuple[str, QuantizedTensor], ...]:
-    shapes = {"weight": (d.width, d.reference_dim + d.residual_dim), "bias": (d.width,)}
-    named = {f"{head}.{name}": shape for head in ("geometry", "appearance") for name, shape in shapes.items()}
-    if d.channels(Role.RESIDUAL) == 0:
-        named["residuals"] = (d.coupled_primitives, d.residual_dim)
-    return tuple(
-        (name, QuantizedTensor(np.rint(rng.laplace(0, 20, shape)).astype(np.int32), 6))
-        for name, shape in named.items()
     )

@@ -27,6 +27,7 @@ ALLOWED = {
         "codec",
         "render",
         "evaluation",
+        "exporting",
     },
     "errors": set(),
     "interrupt": set(),
@@ -42,15 +43,17 @@ ALLOWED = {
     "entropy": BASE,
     "losses": BASE,
     "metrics": BASE,
-    "trained_model": BASE | {"model", "entropy"},
+    "stored_weights": BASE | {"model", "entropy"},
+    "trained_model": BASE | {"model", "entropy", "stored_weights"},
     "codec": BASE | {"model", "entropy", "trained_model"},
-    "export": BASE | {"model"},
+    "formats": BASE | {"model", "render", "codec"},
     "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
-    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "export"},
+    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
     "viewer": BASE,
+    "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},
     "cli": BASE
-    | {"scene", "render", "model", "metrics", "codec", "export", "training", "evaluation", "trained_model"}
-    | {"viewer"},
+    | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
+    | {"trained_model", "exporting", "viewer"},
     "__main__": BASE | {"cli"},
 }
 
@@ -111,6 +114,12 @@ def test_importing_the_package_loads_neither_torch_nor_numba() -> None:
     assert not loaded & {"torch", "numba", "scipy", "PIL"}
 
 
+def test_formats_are_read_and_written_without_torch() -> None:
+    loaded = modules_after("import compgs.formats")
+    assert "compgs.formats.sog" in loaded
+    assert not loaded & {"torch", "numba", "scipy"}
+
+
 def test_the_command_line_starts_without_torch() -> None:
     loaded = modules_after("import compgs.cli.main")
     assert "tyro" in loaded
@@ -142,6 +151,23 @@ def test_decoding_never_loads_scenes_losses_or_training() -> None:
 def test_from_bytes_to_symbols_no_torch_is_loaded(module: str) -> None:
     loaded = modules_after(f"import compgs.codec.{module}")
     assert f"compgs.codec.{module}" in loaded
+    assert "torch" not in loaded
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "constants",
+        "arrays",
+        "residual_mlp_kernels",
+        "prediction_kernels",
+        "spherical_harmonics_kernels",
+        "inference",
+    ],
+)
+def test_from_arrays_to_gaussians_no_torch_is_loaded(module: str) -> None:
+    loaded = modules_after(f"import compgs.model.{module}")
+    assert f"compgs.model.{module}" in loaded
     assert "torch" not in loaded
 
 

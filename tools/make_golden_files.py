@@ -17,6 +17,7 @@ import numpy as np
 from compgs.codec.content import FileContent, GroupShape, Latents, Role
 from compgs.codec.format import MAX_SYMBOL
 from compgs.codec.reader import read_latents
+from compgs.codec.viewpoints import Viewpoint, Viewpoints
 from compgs.codec.writer import write_content
 
 ROOT = Path(__file__).parent.parent
@@ -38,6 +39,15 @@ ODD_GROUPS = (
     GroupShape(Role.LOG_SCALES, 4, (0.125, 0.25, 0.5, 0.0625), (), sees_coordinates=True),
     GroupShape(Role.RESIDUAL, 1, (0.5,)),
     GroupShape(Role.RESIDUAL, 2, (1.0, 0.5), (2, 3, 6), sees_coordinates=True),
+)
+
+VIEWPOINTS = Viewpoints(
+    up=(0.0, -0.6, 0.8),
+    views=(
+        Viewpoint((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 640, 480, 500.0, 510.0),
+        Viewpoint((0.5, -0.5, 0.5, 0.5), (2.0, 0.25, 1.0), 640, 480, 500.0, 510.0),
+        Viewpoint((0.0, 0.6, 0.0, 0.8), (-1.0, 2.0, 0.5), 480, 640, 450.5, 450.5),
+    ),
 )
 
 
@@ -64,7 +74,7 @@ def odd() -> tuple[FileContent, list[int]]:
         group.symbols[4, -1] = -MAX_SYMBOL
         group.symbols[5, 0] = MAX_SYMBOL
     content = replace(content, world_offset=(-1.5, 1e6, 0.1), metadata={"note": "Ä", "creator": "made up"})
-    return content, [0, 4, 7]
+    return replace(content, viewpoints=VIEWPOINTS), [0, 4, 7]
 
 
 def hashes(content: FileContent, latents: Latents) -> dict[str, str]:

@@ -13,8 +13,9 @@ from compgs.config import Config, EntropyConfig, ModelConfig
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import CorruptSection, NotEncodable, OutputError, TruncatedSection
-from compgs.model.prediction import SHARED_RESIDUALS
-from compgs.trained_model import SHARED_RESIDUAL_BITS, TrainedModel
+from compgs.model.constants import SHARED_RESIDUALS
+from compgs.stored_weights import SHARED_RESIDUAL_BITS
+from compgs.trained_model import TrainedModel
 
 OWN_RESIDUALS = Config(model=ModelConfig(residuals=True))
 
@@ -245,14 +246,22 @@ def test_a_beginning_of_a_file_is_the_coarse_part_of_its_scene(tmp_path, config)
         for count in (part.bytes, part.bytes + 7):
             coarse = decode(path, prefix=count).primitives
             assert len(coarse.positions) == part.anchors
-            for name in ("positions", "log_scales", "references"):
+            for name in ("positions", "references"):
                 assert torch.equal(getattr(coarse, name), getattr(whole, name)[: part.anchors]), name
+            assert torch.equal(coarse.log_scales[:, :3], whole.log_scales[: part.anchors, :3])
+            # What stands for many is larger: by the cube root of their number, all volumes together stay.
+            growth = (coarse.log_scales - whole.log_scales[: part.anchors])[:, 3:]
+            many = torch.exp(3 * growth).double()
+            assert (many > 1 - 1e-4).all()
+            torch.testing.assert_close(
+                many.sum(0), torch.full((3,), 1.0 * len(whole.positions)).double(), rtol=1e-4, atol=0
+            )
             coupled = len(coarse.residuals)
             assert torch.equal(coarse.residuals, whole.residuals[:coupled])
             assert torch.equal(coarse.anchor_index, whole.anchor_index[:coupled])
             assert (whole.anchor_index[coupled:] >= part.anchors).all()
     assert torch.equal(decode(path, prefix=10 * size).primitives.positions, whole.positions)
-    with pytest.raises(TruncatedSection, match=r"a\.cgs: latents: header promises"):
+    with pytest.raises(TruncatedSection, match=r"a\.cgs: latents: of \d+ bytes nothing can be shown yet"):
         decode(path, prefix=ranges[0].bytes - 1)
     for nothing in (0, -5):
         with pytest.raises(TruncatedSection, match=r"a\.cgs: header"):

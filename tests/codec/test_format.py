@@ -169,7 +169,7 @@ def test_a_beginning_of_a_file_has_the_sections_that_are_whole() -> None:
         with pytest.raises(TruncatedSection) as refused:
             unpack(data[:size], prefix=True)
         if size >= container_bytes(data[6]):
-            assert str(refused.value).startswith(f"{whole[present].name}: header promises")
+            assert str(refused.value).startswith(f"{whole[present].name}: of {size} bytes nothing can be")
     for size in range(first, len(data)):
         with pytest.raises(TruncatedSection):
             unpack(data[:size])

@@ -105,28 +105,29 @@ def test_a_beginning_up_to_any_byte_is_the_first_anchors_of_the_whole(content: F
 def test_a_beginning_without_a_range_is_refused_by_the_name_of_what_is_missing(content: FileContent) -> None:
     data = write_content(content, levels=allowed_levels(content))
     first = next(end for number, end in section_ends(data) if number == LATENTS)
-    with pytest.raises(TruncatedSection, match="latents: header promises"):
+    with pytest.raises(
+        TruncatedSection, match=f"latents: of {first - 1} bytes nothing can be shown yet, .* {first}"
+    ):
         read_latents(data[: first - 1], prefix=True)
     for section, end in zip(unpack(data), section_ends(data), strict=True):
         if section.number == LATENTS:
             break
         if section.data:
-            with pytest.raises(TruncatedSection, match=f"{section.name}: header promises"):
+            with pytest.raises(TruncatedSection, match=f"{section.name}: of {end[1] - 1} bytes nothing"):
                 read_latents(data[: end[1] - 1], prefix=True)
     with pytest.raises(TruncatedSection, match="header"):
         read_latents(data[:20], prefix=True)
 
 
-def test_a_file_that_lacks_its_last_range_is_only_a_beginning(content: FileContent) -> None:
-    """Its header says so: as a whole file it is refused."""
+def test_a_file_whose_last_range_is_missing_is_refused_as_a_beginning_too(content: FileContent) -> None:
+    """All that its header names has arrived, and still it does not reach the octree's depth."""
     levels = allowed_levels(content)
     sections = unpack(write_content(content, levels=levels))
     last = max(i for i, section in enumerate(sections) if section.number == LATENTS)
     shorter = pack(sections[:last] + sections[last + 1 :])
-    with pytest.raises(CorruptSection, match="latents: the last level is"):
-        read_content(shorter)
-    coarse = read_latents(shorter, prefix=True)[0]
-    assert same_symbols(coarse, content, int(level_counts(content.coordinates)[levels[-2]]))
+    for prefix in (False, True):
+        with pytest.raises(CorruptSection, match="latents: the last level is"):
+            read_latents(shorter, prefix=prefix)
 
 
 def with_head(data: bytes, index: int, head: RangeHead) -> bytes:
@@ -193,16 +194,21 @@ def test_a_range_that_another_scene_follows_is_refused(content: FileContent) -> 
     [
         ([1], [0]),
         ([1, 8, 64, 349], [3]),  # below 350 anchors there is one range
-        ([1, 8, 64, 350], [2, 3]),  # then two: level 2 has less than half of all
-        ([1, 8, 176, 350], [1, 3]),  # level 2 has more than half
-        ([1, 8, 175, 350], [2, 3]),  # level 2 has just half
-        ([1, 350, 350, 350], [0, 3]),  # levels that bring nothing
-        ([300, 400, 690, 700], [0, 3]),  # what is left below has to be half
+        ([1, 8, 64, 350], [2, 3]),  # then two: level 2 has less than two thirds of all
+        ([1, 40, 236, 351], [1, 3]),  # level 2 has more than two thirds
+        ([1, 40, 234, 351], [2, 3]),  # level 2 has just two thirds
+        ([1, 10, 350, 350], [3]),  # level 1 has less than a 32nd, and level 2 brings nothing
+        ([1, 11, 350, 350], [1, 3]),  # level 1 has a 32nd
+        ([300, 400, 690, 700], [1, 3]),  # what is left below has to be two thirds
         ([1, 10, 100, 200, 400, 800, 1600], [2, 3, 4, 5, 6]),  # as many as 1600 / 350 + 1 allow
-        ([1, 4, 16, 64, 256, 1024, 4096, 16384, 65536, 262144], [2, 3, 4, 5, 6, 7, 8, 9]),  # eight at most
+        ([1, 4, 16, 64, 256, 1024, 4096, 16384, 65536, 262144], [7, 8, 9]),  # fewer than 8192 show nothing
+        ([1, *(10_000 * 2**i // 2 for i in range(5))], [1, 2, 3, 4, 5]),
+        ([int(1000 * 1.6**i) for i in range(12)], [4, 5, 6, 7, 8, 9, 10, 11]),  # eight at most
     ],
 )
-def test_a_range_has_at_least_as_many_anchors_as_all_before_it(counts: list[int], levels: list[int]) -> None:
+def test_a_range_has_at_least_half_as_many_anchors_as_all_before_it(
+    counts: list[int], levels: list[int]
+) -> None:
     assert chosen_levels(np.array(counts)) == levels
 
 

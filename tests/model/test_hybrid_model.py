@@ -7,7 +7,14 @@ import pytest
 import torch
 
 from compgs.cameras import Camera
-from compgs.model import HybridModel, PredictionHeads, Primitives, hybrid_model, predict
+from compgs.model import (
+    HeadDimensions,
+    HybridModel,
+    Primitives,
+    hybrid_model,
+    make_heads,
+    predict,
+)
 from compgs.model.primitives import select_anchors
 
 N, D, G = 40, 12, 8
@@ -28,7 +35,7 @@ def make_model(
         anchor_index=torch.repeat_interleave(counts),
         voxel_size=0.05,
     )
-    return HybridModel(primitives, PredictionHeads(D, G, 16, layout), 4.0, (0.0, 0.0, 0.0))
+    return HybridModel(primitives, make_heads(layout, HeadDimensions(D, G, 16)), 4.0, (0.0, 0.0, 0.0))
 
 
 @pytest.fixture

@@ -6,7 +6,15 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.losses import scale_regularizer
-from compgs.model import HybridModel, PredictionHeads, Primitives, hybrid_model, predict
+from compgs.model import (
+    HeadDimensions,
+    HybridModel,
+    PredictionHeads,
+    Primitives,
+    hybrid_model,
+    make_heads,
+    predict,
+)
 from compgs.model.primitives import every_slot
 from compgs.render import rasterize
 
@@ -17,7 +25,7 @@ CAMERA = Camera(np.eye(4), 30, 30, 16, 12, 32, 24)
 def make(layout: str, dtype: torch.dtype) -> tuple[PredictionHeads, Primitives]:
     g = torch.Generator().manual_seed(1)
     torch.manual_seed(0)
-    heads = PredictionHeads(D, G, 16, layout).to(dtype)
+    heads = make_heads(layout, HeadDimensions(D, G, 16)).to(dtype)
     positions, log_scales, references, residuals = (
         torch.randn(shape, generator=g).to(dtype) for shape in ((N, 3), (N, 6), (N, D), (N * K, G))
     )
@@ -54,7 +62,7 @@ def test_a_decoded_scene_looks_the_same_where_nothing_is_left_out(monkeypatch, l
     model = HybridModel(p, heads.requires_grad_(False), 4.0, (0.0, 0.0, 0.0))
     chosen = model.gaussians(CAMERA)
     monkeypatch.setattr(hybrid_model, "choosing_pays", lambda device: False)
-    monkeypatch.setattr(HybridModel, "_fused", property(lambda self: False))
+    monkeypatch.setattr(HybridModel, "_in_kernels", property(lambda self: False))
     everything = model.gaussians(CAMERA)
     assert len(everything) == N * K > len(chosen)
     with torch.no_grad():

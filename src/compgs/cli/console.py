@@ -67,7 +67,7 @@ def print_ranges(ranges: "Sequence[RangeInfo]") -> None:
 
 
 def _print_shares(components: Mapping[str, int], counts: Mapping[str, int]) -> None:
-    """Bytes by component, and bits by heading: of what there are so many in the file."""
+    """A table of bytes by component; each of the `counts` gets a column: bits per one of them."""
     total = sum(components.values())
     table = Table(box=None, pad_edge=False)
     for heading in ("component", "bytes", "share", *counts):

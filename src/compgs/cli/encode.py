@@ -60,7 +60,7 @@ class Encode(ComputingCommand, ReadingOptions):
         Path | None,
         arg(metavar="SCENE", help_behavior_hint="(default for a run: its own, where it still is)"),
     ] = None
-    """Scene whose views say what contributes and what is lost."""
+    """Scene whose photographs show what contributes and what is lost."""
 
     cameras: Annotated[str | None, arg(metavar="N|none", help_behavior_hint="(default: the run's, 12)")] = (
         None
@@ -160,7 +160,7 @@ class Encode(ComputingCommand, ReadingOptions):
         return data
 
     def judges(self, data: bytes) -> "tuple[list[Camera], tuple[View, ...], str]":
-        """Cameras to judge with, held-out views, and which they are."""
+        """Cameras by which contribution and loss are measured, held-out views, and a text that says which cameras."""
         source = self.scene_source()
         if source is not None:
             scene = read_scene(source)

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 from compgs.cli.command import Command, FileArgument
 from compgs.cli.console import console, print_components, print_ranges, say, size
-from compgs.cli.inputs import named, read_bitstream
+from compgs.cli.inputs import read_bitstream
 
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Command, FileArgument):
-    """Show what is in a .cgs file: bytes, bits per anchor and per coupled primitive of every component; and after how
-    many bytes it can be shown coarsely: with the anchors up to a level of the octree.
+    """Show what is in a .cgs file: bytes of every component, and bits per anchor and per coupled primitive. Then which
+    beginnings of the file are scenes: after how many bytes the anchors up to each octree level are there.
 
     Example
 
@@ -20,6 +20,7 @@ class Info(Command, FileArgument):
     def run(self) -> None:
         data = read_bitstream(self.file)
         from compgs.codec.reader import file_info
+        from compgs.formats.cgs import named
 
         with named(self.file):
             info = file_info(data)

@@ -18,7 +18,7 @@ class Method:
     """One way from a scene to a file."""
 
     extension: str  # of the file
-    settings: tuple[str, ...]  # sections (`splats`) and single settings (`training.steps`) that it looks at
+    settings: tuple[str, ...]  # sections (`splats`) and single settings (`training.steps`) that it uses
     train: Callable[..., Any]  # arguments as of `compgs.train`
     write: Callable[[Any, Path], int]  # model and path to write it to, replacing what is there; bytes
 
@@ -42,7 +42,7 @@ def _train_splats(*arguments: Any, **options: Any) -> "SplatModel":
 
 
 def _write_splats(model: "SplatModel", path: Path) -> int:
-    from compgs.export import write_ply
+    from compgs.formats import write_ply
 
     return write_ply(model.splats, path, world_offset=model.world_offset, overwrite=True)
 
@@ -65,7 +65,7 @@ METHODS = {
 
 
 def check_settings_of(method: str, assignments: Iterable[str]) -> None:
-    """Of `section.key=value` assignments: raises UsageError for one that the method would not look at."""
+    """Raises UsageError for a `section.key=value` assignment of a setting that the method does not use."""
     known = METHODS[method].settings
     for assignment in assignments:
         name = assignment.partition("=")[0].strip()

@@ -15,13 +15,13 @@ from compgs.model.prediction import Prediction
 from compgs.render import RasterSettings, contributions
 from compgs.scene.views import View
 
-# Views that a mere look at the size takes, and a pruning, which the rest of the run makes up for: of more, as many
-# spread over all. What the file leaves out at the end is decided by all views: of one of them it might be the only one.
+# Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
+# up for an error. All views decide what the file leaves out at the end, since a primitive may matter to one alone.
 LOOKED_AT, PRUNED_BY = 48, 256
 
 
 def spread(views: Sequence[View], most: int) -> Sequence[View]:
-    """At most so many of the views, evenly spread over their order."""
+    """At most `most` of the views, evenly spread over their order."""
     if len(views) <= most:
         return views
     return [views[i * len(views) // most] for i in range(most)]
@@ -35,7 +35,10 @@ def view_contributions(
     settings: RasterSettings,
     device: torch.device,
 ) -> Tensor:  # [N, K] float64, pixels
-    """Of all coupled primitives to the views. `predicted`: visible anchors [V] and their prediction, None: none are."""
+    """Contributions of all coupled primitives to the views.
+
+    `predicted`: for a camera, the visible anchors [V] and their prediction, or None if no anchor is visible.
+    """
     total = torch.zeros(shape[0] * shape[1], dtype=torch.float64, device=device)
     for view in views:
         seen = predicted(view.camera)

@@ -69,7 +69,7 @@ def train_splats(
     device: str | torch.device | None = None,
     profile: StepProfile | None = None,
 ) -> SplatModel:
-    """Train plain 3DGS on a scene; the result is ready for `compgs.export.write_ply`. Arguments as of `train`.
+    """Train plain 3DGS on a scene; the result is ready for `compgs.formats.write_ply`. Arguments as of `train`.
 
     Of the settings, `splats` applies, and of `training` the steps, the seed, the loss and the checkpoints.
 
@@ -93,7 +93,7 @@ class SplatTrainer:
     """State of a run: splats, optimizer, density control, and the order in which views come."""
 
     kind = "splats"
-    lmbda = None  # nothing is weighed against the size
+    lmbda = None  # no rate in the loss
 
     def __init__(
         self,
@@ -164,7 +164,7 @@ class SplatTrainer:
         return photometric_loss(rendered.image, target, self.config.training.ssim_weight)
 
     def backward(self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians) -> None:
-        """The gradients; what connects the parts is named for who watches (`stations`)."""
+        """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
         loss.backward()
 
     def update(self) -> None:
@@ -199,7 +199,7 @@ class SplatTrainer:
         run_to_end(self, self.config.training, path, on_progress)
 
     def estimated_bytes(self) -> int:
-        """Of the .ply file, were it written now: its size without the header."""
+        """Size of the .ply file if it were written now, without its header."""
         return 4 * len(self.parameters) * (STORED_NUMBERS + self.parameters.rest[0].numel())
 
     def finish(self) -> None:

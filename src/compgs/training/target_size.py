@@ -14,11 +14,11 @@ from compgs.training.file_size import fixed_bytes, latent_bytes
 from compgs.training.importance import missed, worth_keeping
 from compgs.training.rate_control import LOOKS, RateState, due, follow
 
-SHARES = 10  # looks in a run at how much will still be pruned and dropped
+SHARES = 10  # times in a run that the effect of later pruning is predicted
 
 
 def pruned_share(config: Config, lmbda: float) -> float:
-    """Of all blending weights: what the anchors that are removed together may make up, once."""
+    """Share of all blending weights that the anchors removed in one pruning may have together."""
     return min(0.5, config.control.prune_share * rate_weight(config.control, lmbda))
 
 
@@ -30,7 +30,7 @@ class TargetSize:
         model: TrainedModel,
         schedule: ControlSchedule,
         pruned_at: frozenset[int],
-        contributions: Callable[[], Tensor],  # [N, K] of the coupled primitives, to views that stand for all
+        contributions: Callable[[], Tensor],  # [N, K] of the coupled primitives, to a sample of the views
     ) -> None:
         self.model = model
         self.config = model.config
@@ -45,8 +45,9 @@ class TargetSize:
             )
 
     def follow(self, state: RateState, step: int) -> RateState:
-        """Where a size is asked for, what lambda becomes after so many steps. Raises TrainingError if latents are not
-        finite any more.
+        """The state after a step, with its new lambda; unchanged where no size is asked for.
+
+        Raises TrainingError if the latents are not finite any more.
         """
         t = self.config.training
         if t.target_bytes is None or not due(step, t.steps, t.rate_start):
@@ -62,12 +63,12 @@ class TargetSize:
         return follow(state, size * state.share, target, progress=step / t.steps, grown=grown)
 
     def size(self) -> float:
-        """Bytes that lambda can change."""
+        """Bytes of the file that depend on lambda: latents and positions, without the networks."""
         bits = latent_bytes(self.model)
         return math.floor(bits) if math.isfinite(bits) else bits
 
     def lasting_share(self, lmbda: float, step: int) -> float:
-        """Of these bytes, those that stay when all is removed that will be, by the end of the run."""
+        """Predicted share of the bytes of `size` that is left at the end of the run, after the last pruning."""
         model, size = self.model, self.size()
         total = self.contributions()
         still = sum(at >= step for at in self.pruned_at)

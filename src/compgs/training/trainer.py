@@ -185,16 +185,16 @@ class Trainer:
 
     @property
     def stored(self) -> bool:
-        """The networks' weights are already those that the file will hold."""
+        """Whether this late in the run the networks compute with weights rounded as the file will hold them."""
         return self.progress >= self.config.training.quantized_weights
 
     def predict_some(self, latents: Quantized, rows: Tensor, camera: Camera) -> tuple[Prediction, Gaussians]:
-        """All that the view may show (Sec. 3.2), and that of it which this step does not do without."""
+        """What the view may show (Sec. 3.2), and its Gaussians without those that chance leaves out of this step."""
         prediction = self.predict(latents, rows, camera, self.stored)
         return prediction, thinned(prediction, self.left_out, self.noise)
 
     def predict(self, latents: Quantized, rows: Tensor, camera: Camera, stored: bool) -> Prediction:
-        """On the GPU all primitives of the anchors in view: choosing among them would mean waiting for it."""
+        """On the GPU all primitives of the anchors in view: to choose among them the CPU would have to wait for it."""
         model = self.model
         return predict(
             model.heads,
@@ -216,13 +216,13 @@ class Trainer:
         return photometric_loss(rendered.image, target, self.config.training.ssim_weight)
 
     def regularize(self, prediction: Prediction, gaussians: Gaussians, camera: Camera) -> Tensor:
-        """What distortion has beside the image: large primitives, and a scene about to vanish."""
+        """The part of the distortion beside the image's: penalties on large primitives and on a vanishing scene."""
         unit = scale_unit(gaussians.means, camera_center(camera, self.device), self.scene.extent)
         volumes = scale_regularizer(gaussians.scales / unit, prediction.drawn)
         return self.config.training.scale_weight * volumes + vanishing_loss(prediction)
 
     def add_rate(self, distortion: Tensor, latents: Quantized) -> Tensor:
-        """D + lambda R (Eq. 1), once the rate has joined; without lambda only the entropy model learns it."""
+        """D + lambda R (Eq. 1), once the rate has joined the loss; with lambda 0 only the entropy model learns R."""
         if not latents.bits:
             return distortion
         r = rate(latents.bits, self.channels(), self.config.training.rate)
@@ -232,7 +232,7 @@ class Trainer:
         return distortion
 
     def channels(self) -> dict[str, int]:
-        """Coded symbols of each stream, of an anchor."""
+        """Symbols that each stream codes for an anchor, by the stream's name."""
         m, e = self.config.model, self.config.entropy
         own = {
             "residual_hyper": m.coupled_primitives,
@@ -248,7 +248,7 @@ class Trainer:
     def backward(
         self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians, latents: Quantized
     ) -> None:
-        """The gradients; what connects the parts is named for who watches (`stations`)."""
+        """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
         loss.backward()
 
     def update(self, rows: Tensor) -> None:
@@ -289,7 +289,7 @@ class Trainer:
     # events --------------------------------------------------------------------------------------------------------
 
     def grow(self) -> None:
-        """Anchors come where the image still pulls, and go where nothing is seen."""
+        """Add anchors where the image's gradient is large, and remove those that nobody sees."""
         self.control.act(self.model, self.optimizer, self.coupled_means(), self.chance, self.rate.lmbda)
 
     @torch.no_grad()
@@ -299,8 +299,8 @@ class Trainer:
         parts = []
         for rows in torch.arange(model.anchors, device=self.device).split(20_000):
             p = model.primitives(model.quantized(rows, stored_weights=False), rows)
-            raw = model.heads("geometry", p.references, p.residuals, p.anchor_index)
-            means = p.positions[p.anchor_index] + raw[:, :3] * p.offset_scales[p.anchor_index]
+            raw = model.heads.raw_geometry(p.references, p.residuals, p.anchor_index)
+            means = p.positions[p.anchor_index] + raw[:, :3] * p.reach[p.anchor_index]
             parts.append(means.view(-1, k, 3))
         return torch.cat(parts)
 
@@ -311,7 +311,7 @@ class Trainer:
             self.control.keep(self.model, self.optimizer, kept)
 
     def turn_references(self) -> None:
-        """Into their principal axes, for the last time without the channels that hardly say anything."""
+        """Turn the references into their principal axes; the last time, also drop channels that hardly say anything."""
         if not torch.isfinite(self.model.references).all():
             return  # the run has diverged, and the next step will say so
         decorrelate(self.model, self.optimizer)
@@ -320,7 +320,7 @@ class Trainer:
         self.reference_rates = channel_rates(self.model.references)
 
     def contributions(self, most: int = LOOKED_AT) -> Tensor:
-        """[N, K] float64: what the coupled primitives add to the training views, or to `most` that stand for them."""
+        """[N, K] float64: what the coupled primitives add to the training views, or to at most `most` of them."""
 
         def predicted(camera: Camera) -> tuple[Tensor, Prediction] | None:
             rows = self.visible_anchors(camera)
@@ -348,7 +348,7 @@ class Trainer:
         return self.rate.lmbda
 
     def estimated_bytes(self) -> int:
-        """Of the file, were it written now. Raises TrainingError if the latents are not finite any more."""
+        """Size of the file if it were written now. Raises TrainingError if the latents are not finite any more."""
         size = latent_bytes(self.model)
         if not math.isfinite(size):
             raise diverged(self.step, "rate", size)

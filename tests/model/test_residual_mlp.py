@@ -3,8 +3,8 @@ import pytest
 import torch
 from torch import nn
 
-from compgs.model import residual_mlp
-from compgs.model.layers import ResidualMLP
+from compgs.model import residual_mlp_kernels
+from compgs.model.residual_mlp import ResidualMLP
 
 SLOPE = 2.0**-6
 
@@ -96,7 +96,7 @@ def test_results_are_the_same_bits_with_one_thread_and_with_several():
 
 def test_parts_of_the_weight_gradient_never_divide_an_anchor():
     index = inputs(layers(4, 4, 1, 8, 0), 30, 1000)[2].numpy()
-    bounds = residual_mlp.chunk_bounds(index, 16)
+    bounds = residual_mlp_kernels.chunk_bounds(index, 16)
     assert bounds[0] == 0 and bounds[-1] == 1000 and (bounds[1:] >= bounds[:-1]).all()
     assert all(index[b] != index[b - 1] for b in bounds if 0 < b < 1000)
 

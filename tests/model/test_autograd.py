@@ -1,8 +1,10 @@
+"""Training's way through the kernels, Gaussians and gradients, against plain torch in float64."""
+
 import numba
 import pytest
 import torch
 
-from compgs.model import PredictionHeads, Primitives, predict
+from compgs.model import HeadDimensions, Primitives, make_heads, predict
 from compgs.model.primitives import every_slot
 
 N, K, D, G = 300, 5, 12, 8
@@ -15,12 +17,12 @@ def inputs(dtype):
     return [x.to(dtype).requires_grad_() for x in made]
 
 
-def prediction(dtype, *, revived=False):
+def prediction(dtype, *, revived=False, layout="paired"):
     """Gaussians and gradients of a random function of them by everything that is trained; `revived`: also of the
     opacities of what is not drawn.
     """
     torch.manual_seed(0)
-    heads = PredictionHeads(D, G, 16, "paired").to(dtype)
+    heads = make_heads(layout, HeadDimensions(D, G, 16)).to(dtype)
     positions, log_scales, references, residuals = inputs(dtype)
     index = every_slot(N, K)
     primitives = Primitives(positions.detach() * 3, log_scales, references, residuals, index, 0.05)
@@ -38,10 +40,11 @@ def prediction(dtype, *, revived=False):
     return result.index, [f.detach() for f in fields], gradients
 
 
+@pytest.mark.parametrize("layout", ["paired", "separate"])
 @pytest.mark.parametrize("revived", [False, True])
-def test_fused_prediction_and_its_gradients_agree_with_float64_autograd(revived):
-    index, fields, gradients = prediction(torch.float32, revived=revived)
-    true_index, true_fields, true_gradients = prediction(torch.float64, revived=revived)
+def test_prediction_by_kernels_and_its_gradients_agree_with_float64_autograd(revived, layout):
+    index, fields, gradients = prediction(torch.float32, revived=revived, layout=layout)
+    true_index, true_fields, true_gradients = prediction(torch.float64, revived=revived, layout=layout)
     assert torch.equal(index, true_index) and 100 < len(index) < N * K
     for found, truth in zip(fields + gradients, true_fields + true_gradients, strict=True):
         assert (found.double() - truth).abs().max() <= 2e-5 * truth.abs().max()
