@@ -15,6 +15,16 @@ function embedded(): Uint8Array | null {
   return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 }
 
+/** The name of a file in an address, without its ending. */
+function nameOf(url: string): string {
+  const last = new URL(url, document.baseURI).pathname.split("/").pop()!;
+  try {
+    return decodeURIComponent(last).replace(/\.cgs$/, "") || document.title;
+  } catch {
+    return last; // it has a percent sign that is no code
+  }
+}
+
 function sayError(title: string, text: string): void {
   element("error-title").textContent = title;
   element("error-text").textContent = text;
@@ -71,7 +81,10 @@ function start(): void {
   const data = embedded();
   const url = new URLSearchParams(location.search).get("url");
   if (data) open(data);
-  else if (url) open(url);
+  else if (url) {
+    document.title = nameOf(url);
+    open(url);
+  }
   else element("welcome").hidden = false;
 }
 

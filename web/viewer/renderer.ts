@@ -56,6 +56,11 @@ export class Renderer {
   /** `planes`: of `rows` rows of 2048 primitives, means, then upper and lower parts of covariances, 4 floats each. */
   setGeometry(planes: Float32Array, rows: number): void {
     const { gl } = this;
+    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE) as number;
+    if (PLANES * rows > most) {
+      const splats = (Math.floor(most / PLANES) * ROW).toLocaleString("en");
+      throw new Error(`The scene has more splats than the ${splats} that this device's graphics can hold.`);
+    }
     gl.deleteTexture(this.geometry);
     gl.deleteTexture(this.appearance);
     this.rows = rows;
