@@ -46,7 +46,8 @@ function explain(name: string, message: string): void {
 
 function describe(info: SceneInfo): string {
   const splats = info.coupled.toLocaleString("en");
-  const share = info.anchors < info.totalAnchors ? `, ${Math.round((100 * info.anchors) / info.totalAnchors)} %` : "";
+  const share =
+    info.anchors < info.totalAnchors ? `, ${Math.round((100 * info.anchors) / info.totalAnchors)} %` : "";
   return `${splats} splats${share}`;
 }
 
@@ -84,8 +85,7 @@ function start(): void {
   else if (url) {
     document.title = nameOf(url);
     open(url);
-  }
-  else element("welcome").hidden = false;
+  } else element("welcome").hidden = false;
 }
 
 function wireButtons(viewer: Viewer): void {
@@ -124,7 +124,8 @@ function wireFiles(open: (source: ArrayBuffer) => void): void {
     event.preventDefault();
     document.body.classList.add("dropping");
   });
-  for (const name of ["dragleave", "drop"]) addEventListener(name, () => document.body.classList.remove("dropping"));
+  for (const name of ["dragleave", "drop"])
+    addEventListener(name, () => document.body.classList.remove("dropping"));
   addEventListener("drop", (event) => {
     event.preventDefault();
     void read(event.dataTransfer?.files[0]);

@@ -156,7 +156,10 @@ function newTexture(gl: WebGL2RenderingContext, format: number, width: number, h
 
 function link(gl: WebGL2RenderingContext, vertex: string, fragment: string): WebGLProgram {
   const program = gl.createProgram()!;
-  for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]] as const) {
+  for (const [kind, source] of [
+    [gl.VERTEX_SHADER, vertex],
+    [gl.FRAGMENT_SHADER, fragment],
+  ] as const) {
     const shader = gl.createShader(kind)!;
     gl.shaderSource(shader, source);
     gl.compileShader(shader);
@@ -165,7 +168,9 @@ function link(gl: WebGL2RenderingContext, vertex: string, fragment: string): Web
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
     const logs = gl.getAttachedShaders(program)!.map((shader) => gl.getShaderInfoLog(shader));
-    throw new Error(`the viewer's shaders do not compile here: ${[gl.getProgramInfoLog(program), ...logs].join(" ")}`);
+    throw new Error(
+      `the viewer's shaders do not compile here: ${[gl.getProgramInfoLog(program), ...logs].join(" ")}`,
+    );
   }
   return program;
 }

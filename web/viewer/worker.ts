@@ -52,7 +52,9 @@ function setEye(next: Eye): void {
 async function openUrl(ticket: number, url: string): Promise<void> {
   try {
     const response = await fetch(url).catch((error: Error) => {
-      throw new Error(`${url} cannot be fetched (${error.message}). Another site must allow it by CORS headers.`);
+      throw new Error(
+        `${url} cannot be fetched (${error.message}). Another site must allow it by CORS headers.`,
+      );
     });
     if (!response.ok) throw new Error(`${url}: the server answers ${response.status} ${response.statusText}`);
     const length = Number(response.headers.get("Content-Length")) || null;
@@ -108,7 +110,12 @@ function show(scene: Scene, chosen: Kernels): void {
     remaining: predictor.primitives.anchors,
   };
   const planes = geometryPlanes(predictor.geometry);
-  const message: FromWorker = { kind: "scene", info: infoOf(scene, predictor), planes, rows: rowsOf(scene.coupled) };
+  const message: FromWorker = {
+    kind: "scene",
+    info: infoOf(scene, predictor),
+    planes,
+    rows: rowsOf(scene.coupled),
+  };
   self.postMessage(message, [planes.buffer]);
   isStale = true;
   schedule();
