@@ -1,6 +1,7 @@
 # make demo   a scene is made, trained, encoded, and its file decoded and judged in a new process: about three minutes
 # make test   the test suite
 # make lint   style and types
+# make web    the page that shows scenes in a browser, from web/; needs node 20 or later, and npm
 # Needs python3 (3.11 or later) and make; everything else is installed into .venv in this folder.
 
 PYTHON ?= python3
@@ -13,7 +14,7 @@ export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 # Idle OpenMP threads sleep instead of taking the cores from numba's.
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: help demo test lint venv
+.PHONY: help demo test lint web venv
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -45,3 +46,7 @@ lint: venv
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@$(BIN)/mypy
+
+web:
+	cd web && npm ci --ignore-scripts && npm run --silent build && npm run --silent declarations
+	cp web/dist/page.html src/compgs/viewer/page.html

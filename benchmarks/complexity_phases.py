@@ -137,10 +137,10 @@ def decode(run: Run) -> dict[str, Any]:
 
 def opened(run: Run) -> Any:
     """A .ply does not know its background, which costs the same in every color."""
-    from compgs.evaluation.scene_file import open_scene_file
+    from compgs.formats import open_scene
     from compgs.training.loop import chosen_device
 
-    return open_scene_file(run.file, chosen_device(run.device), BLACK)
+    return open_scene(run.file, chosen_device(run.device), BLACK)
 
 
 def evaluate(run: Run) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from similarity_figures import figure
 from similarity_measures import NEIGHBOURS, Measured, Similarity, measure
 
 from compgs.errors import SplatFileError
-from compgs.export import read_ply
+from compgs.formats import read_ply
 from compgs.outputs import write_bytes, write_json
 
 PLAIN_3DGS = next(variant for variant in STUDIES["components"] if variant.name == "3dgs")

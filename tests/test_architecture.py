@@ -27,6 +27,7 @@ ALLOWED = {
         "codec",
         "render",
         "evaluation",
+        "exporting",
     },
     "errors": set(),
     "interrupt": set(),
@@ -45,11 +46,14 @@ ALLOWED = {
     "stored_weights": BASE | {"model", "entropy"},
     "trained_model": BASE | {"model", "entropy", "stored_weights"},
     "codec": BASE | {"model", "entropy", "trained_model"},
-    "export": BASE | {"model"},
+    "formats": BASE | {"model", "render", "codec"},
     "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
-    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "export"},
+    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
+    "viewer": BASE,
+    "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},
     "cli": BASE
-    | {"scene", "render", "model", "metrics", "codec", "export", "training", "evaluation", "trained_model"},
+    | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
+    | {"trained_model", "exporting", "viewer"},
     "__main__": BASE | {"cli"},
 }
 
@@ -108,6 +112,12 @@ def test_importing_the_package_loads_neither_torch_nor_numba() -> None:
     loaded = modules_after("import compgs")
     assert "compgs" in loaded
     assert not loaded & {"torch", "numba", "scipy", "PIL"}
+
+
+def test_formats_are_read_and_written_without_torch() -> None:
+    loaded = modules_after("import compgs.formats")
+    assert "compgs.formats.sog" in loaded
+    assert not loaded & {"torch", "numba", "scipy"}
 
 
 def test_the_command_line_starts_without_torch() -> None:

@@ -24,7 +24,7 @@ from similarity_measures import (
     variance_left,
 )
 
-from compgs.export import write_ply
+from compgs.formats import write_ply
 from compgs.model.splats import Splats
 
 

@@ -29,6 +29,8 @@ _HOME = {
     "decode": "compgs.codec",
     "render": "compgs.render",
     "evaluate": "compgs.evaluation",
+    "export": "compgs.exporting",
+    "open_scene": "compgs.formats",
     "load_config": "compgs.config",
     "Camera": "compgs.cameras",
     "Gaussians": "compgs.gaussians",
@@ -43,8 +45,10 @@ __all__ = [
     "decode",
     "encode",
     "evaluate",
+    "export",
     "load_config",
     "load_scene",
+    "open_scene",
     "render",
     "train",
 ]
@@ -55,6 +59,8 @@ if TYPE_CHECKING:
     from compgs.config import load_config
     from compgs.errors import CompGSError
     from compgs.evaluation import evaluate as evaluate
+    from compgs.exporting import export
+    from compgs.formats import open_scene
     from compgs.gaussians import Gaussians
     from compgs.render import render
     from compgs.scene import load_scene

@@ -23,8 +23,10 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
     return code, captured.out, captured.err
 
 
-def test_the_seven_commands_are_there() -> None:
-    assert NAMES == ["train", "encode", "decode", "render", "evaluate", "info", "demo-scene"]
+def test_the_nine_commands_are_there() -> None:
+    assert NAMES == [
+        "train", "encode", "decode", "render", "evaluate", "export", "serve", "info", "demo-scene",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
@@ -226,7 +228,7 @@ def test_wrong_input_is_one_clear_line_and_nothing_is_written(
     (tmp_path / "full" / "run.cgs").write_bytes(b"precious")
     (tmp_path / "file").write_bytes(b"something else")
     (tmp_path / "nothing").touch()
-    (tmp_path / "splats.ply").write_bytes(b"ply")
+    (tmp_path / "splats.ply").write_bytes(b"ply\n")
     (tmp_path / "GOLDEN").write_bytes(GOLDEN_FILE.read_bytes())
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 

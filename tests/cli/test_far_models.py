@@ -12,7 +12,7 @@ from compgs.cli.decode import Decode
 from compgs.cli.methods import METHODS
 from compgs.cli.render import Render
 from compgs.config import Config, ModelConfig
-from compgs.export import read_ply
+from compgs.formats import read_ply
 from compgs.model.splats import SplatModel, Splats
 from compgs.trained_model import TrainedModel
 

@@ -14,7 +14,7 @@ import compgs
 from compgs.cli.settings import with_settings
 from compgs.config import load_config
 from compgs.training.splat_trainer import train_splats
-from compgs.export.ply import write_ply
+from compgs.formats.ply import write_ply
 
 scene = compgs.load_scene(sys.argv[1])
 steps = ("training.steps=60", "training.rate_start=0.2", "control.start=0.2", "control.minimum_views=2")

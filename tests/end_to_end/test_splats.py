@@ -11,7 +11,7 @@ from PIL import Image
 
 from compgs.cli import train as train_command
 from compgs.cli.main import main
-from compgs.export import read_ply
+from compgs.formats import read_ply
 from compgs.metrics import psnr
 from compgs.training import TrainingStatus
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError
-from compgs.evaluation.camera_path import camera_entry, look_at, orbit, read_cameras
+from compgs.evaluation.camera_path import between, camera_entry, look_at, orbit, read_cameras
 
 GOOD = camera_entry(Camera(np.eye(4), 100.0, 101.0, 32.0, 24.0, 64, 48), "a view")
 
@@ -86,3 +86,40 @@ def test_every_camera_of_an_orbit_looks_at_the_middle(up, elevation: float, dist
         assert camera.rotation[1] @ direction < 0  # the image's y axis points down
         height = (camera.center - middle) @ direction / np.linalg.norm(camera.center - middle)
         assert np.arcsin(height) == pytest.approx(np.deg2rad(elevation), abs=1e-6)
+
+
+def test_cameras_between_others_look_as_their_neighbours_do() -> None:
+    positions = np.random.default_rng(0).normal(size=(50, 3))
+    ring = [camera for _, camera in orbit(positions, frames=12, width=64, height=48)]
+    more = between(ring, 40)
+    assert len(more) == 40
+    middle = np.mean([camera.center for camera in ring], axis=0)
+    radius = np.linalg.norm(ring[0].center - middle)
+    step = np.linalg.norm(ring[0].center - ring[1].center)
+    centers = np.stack([camera.center for camera in ring])
+    for camera in more:
+        np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
+        assert (camera.fx, camera.width, camera.height) == (ring[0].fx, 64, 48)
+        # Between neighbours, at most two steps apart, and a little aside.
+        assert np.linalg.norm(centers - camera.center, axis=1).min() < 1.2 * step
+        assert 0.5 * radius < np.linalg.norm(camera.center - middle) < 1.5 * radius
+        nearest = ring[np.linalg.norm(centers - camera.center, axis=1).argmin()]
+        assert camera.rotation[2] @ nearest.rotation[2] > np.cos(np.deg2rad(75))
+    distances = np.linalg.norm(centers[:, None] - np.stack([c.center for c in more]), axis=2).min(0)
+    assert np.median(distances) > 0.1 * step  # they are not those that were there
+
+
+def test_cameras_between_are_the_same_every_time_and_others_for_another_seed() -> None:
+    ring = [camera for _, camera in orbit(np.eye(3), frames=5, width=8, height=8)]
+    poses = [np.stack([c.world_to_camera for c in between(ring, 6, seed=seed)]) for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(poses[0], poses[1])
+    assert not np.allclose(poses[0], poses[2])
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_or_two_cameras_have_others_between_them(count: int) -> None:
+    ring = [camera for _, camera in orbit(np.eye(3), frames=5, width=8, height=8)][:count]
+    more = between(ring, 4)
+    assert len(more) == 4 and all(np.isfinite(camera.world_to_camera).all() for camera in more)
+    if count == 1:
+        np.testing.assert_allclose(more[0].world_to_camera, ring[0].world_to_camera, atol=1e-12)

@@ -24,8 +24,10 @@ class StandIn:
     """Renders a fixed image whatever the camera."""
 
     level: float  # 0 to 1
-    anchors: int = 50
-    coupled: int = 400
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {"anchors": 50, "coupled_primitives": 400}
 
 
 def make_scene(levels: list[int], *, size: tuple[int, int] = (24, 32)) -> Scene:
@@ -48,15 +50,13 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file that decodes to flat images of level 100."""
     path = tmp_path / "flat.cgs"
     path.write_bytes(b"x" * 1000)
-    sections = (SimpleNamespace(name="positions", bytes=300), SimpleNamespace(name="weights", bytes=700))
     module = "compgs.evaluation.measure"
 
     def render(model: StandIn, camera: Camera) -> SimpleNamespace:
         return SimpleNamespace(image=torch.full((camera.height, camera.width, 3), model.level))
 
-    files = "compgs.evaluation.scene_file"
-    monkeypatch.setattr(f"{files}.decode", lambda path, device: StandIn(100 / 255))
-    monkeypatch.setattr(f"{files}.file_info", lambda data: SimpleNamespace(sections=sections))
+    monkeypatch.setattr(f"{module}.open_scene", lambda path, device, background: StandIn(100 / 255))
+    monkeypatch.setattr(f"{module}.component_bytes", lambda path: {"positions": 300, "weights": 700})
     monkeypatch.setattr(f"{module}.render", render)
     return path
 

@@ -15,9 +15,10 @@ from compgs.codec.writer import write_content
 from compgs.config import Config, ModelConfig
 from compgs.errors import ConfigError
 from compgs.evaluation.camera_path import orbit, surround
-from compgs.evaluation.importance import importance
+from compgs.evaluation.importance import importance, splat_importance
 from compgs.evaluation.reduction import most_important, reduce_file
 from compgs.model.hybrid_model import HybridModel
+from compgs.model.splats import SplatModel, Splats
 from compgs.render import render
 from compgs.scene.views import View
 from compgs.trained_model import TrainedModel
@@ -47,6 +48,26 @@ def decoded(data: bytes) -> HybridModel:
 def cameras(data: bytes) -> list[Camera]:
     positions = decoded(data).primitives.positions.numpy()
     return [camera for _, camera in orbit(positions, frames=5, width=48, height=36)]
+
+
+def test_importance_of_splats_sums_over_cameras_and_shares_the_pixels(cameras: list[Camera]) -> None:
+    chance = torch.Generator().manual_seed(0)
+    splats = Splats(
+        means=torch.randn(40, 3, generator=chance) * 0.3,
+        log_scales=torch.full((40, 3), -2.0),
+        quaternions=torch.randn(40, 4, generator=chance),
+        opacity_logits=torch.randn(40, generator=chance),
+        dc=torch.zeros(40, 3),
+        rest=torch.zeros(40, 0, 3),
+    )
+    model, calls = SplatModel(splats, (0.0, 0.0, 0.0)), []
+    found = splat_importance(model, cameras, lambda: calls.append(None))
+    covered = sum(float((1 - render(model, c).transmittance).sum()) for c in cameras)
+    assert float(found.sum()) == pytest.approx(covered, rel=1e-4)
+    assert len(calls) == len(cameras)
+    far = SplatModel(splats, (0.0, 0.0, 0.0), (1e5, 0.0, 0.0))
+    moved = [camera.moved((-1e5, 0.0, 0.0)) for camera in cameras]
+    torch.testing.assert_close(splat_importance(far, moved), found, rtol=1e-3, atol=1e-3)
 
 
 def image(model: HybridModel, camera: Camera) -> np.ndarray:

@@ -6,10 +6,10 @@ import torch
 
 from compgs.config import Config, SplatConfig, TrainingConfig
 from compgs.errors import CheckpointError, ConfigError, TrainingError
-from compgs.export.ply import ply_bytes
+from compgs.formats import arrays_of, encoded
 from compgs.gaussians import Gaussians
 from compgs.metrics import psnr, to_8bit
-from compgs.model.splats import SplatModel
+from compgs.model.splats import SplatModel, Splats
 from compgs.render import RasterSettings, rasterize, render
 from compgs.scene.views import Points
 from compgs.training import SplatTrainer, Trainer, train_splats
@@ -31,6 +31,10 @@ def config() -> Config:
 
 # Growth after steps 8, 18, 28, 38; resets after 15 and 30: short runs have none of their own accord.
 SCHEDULE = DensifySchedule(start=8, stop=45, every=10, reset_every=15)
+
+
+def ply_bytes(splats: Splats) -> bytes:
+    return encoded(arrays_of(splats), "ply")
 
 
 def file_of(model) -> bytes:

@@ -56,7 +56,7 @@ class SceneFileArgument:
     """Which file, of those that hold a scene."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """The .cgs file, or a .ply file of splats as 3DGS writes it."""
+    """A .cgs file, or splats: .ply as 3DGS writes it, .spz, .sog (or its meta.json), .glb, .splat."""
 
 
 @dataclass(frozen=True, kw_only=True)

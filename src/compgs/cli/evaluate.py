@@ -8,7 +8,6 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions, check_lpips
 from compgs.cli.console import print_results, say
-from compgs.cli.inputs import check_scene_file
 from compgs.cli.progress import counting
 from compgs.cli.scenes import read_scene
 from compgs.outputs import check_output_folder
@@ -16,7 +15,7 @@ from compgs.outputs import check_output_folder
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
-    """Decode a .cgs or .ply file, render a scene's held-out views from it and compare them with the photographs.
+    """Decode a file, render a scene's held-out views from it and compare them with the photographs.
 
     Give -r, --images, --test-every and --background as in training: the views held out there are the ones to
     evaluate on.
@@ -42,7 +41,9 @@ class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
     """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
 
     def run(self) -> None:
-        check_scene_file(self.file)
+        from compgs.formats import check_scene
+
+        check_scene(self.file)
         if self.output is not None:
             check_output_folder(self.output, overwrite=self.overwrite)
         source = self.scene_source()

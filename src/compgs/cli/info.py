@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from compgs.cli.command import Command, FileArgument
 from compgs.cli.console import console, print_components, print_ranges, say, size
-from compgs.cli.inputs import named, read_bitstream
+from compgs.cli.inputs import read_bitstream
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +20,7 @@ class Info(Command, FileArgument):
     def run(self) -> None:
         data = read_bitstream(self.file)
         from compgs.codec.reader import file_info
+        from compgs.formats.cgs import named
 
         with named(self.file):
             info = file_info(data)

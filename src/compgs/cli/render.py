@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -11,7 +11,6 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions
 from compgs.cli.console import duration, say
-from compgs.cli.inputs import check_scene_file
 from compgs.cli.progress import counting
 from compgs.cli.scenes import read_scene
 from compgs.cli.usage import UsageError, check_range
@@ -19,7 +18,7 @@ from compgs.outputs import check_output_folder, write_bytes, write_json
 
 if TYPE_CHECKING:
     from compgs.cameras import Camera
-    from compgs.evaluation.scene_file import SceneModel
+    from compgs.render import Renderable
     from compgs.scene import Scene
 
 BLACK = (0.0, 0.0, 0.0)
@@ -28,7 +27,7 @@ MAX_SIDE = 16_384  # pixels
 
 @dataclass(frozen=True, kw_only=True)
 class Render(ComputingCommand, SceneOptions, SceneFileArgument):
-    """Render images from a .cgs or .ply file: views of a scene, cameras of a JSON file, or a circle around the scene.
+    """Render images from a file of splats: views of a scene, cameras of a JSON file, or a circle around the scene.
 
     A camera file is a list of objects with world_to_camera (4 x 4, OpenCV axes), fx, fy, cx, cy, width and
     height; training and evaluation leave one, cameras.json. Images are 00000.png, 00001.png, ...; the
@@ -49,7 +48,7 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
     background: Annotated[
         tuple[float, float, float] | None, arg(metavar="R G B", help_behavior_hint=NO_DEFAULT)
     ] = None
-    """Color behind everything, 0 to 1, in place of the file's own; a .ply file has none: by default the scene's, or
+    """Color behind everything, 0 to 1, in place of the file's own; only .cgs files have one: by default the scene's, or
     black."""
 
     split: Literal["test", "train", "all"] = "test"
@@ -87,21 +86,21 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
 
     def run(self) -> None:
         self.check_values()
-        check_scene_file(self.file)
+        from compgs.formats import check_scene, open_scene
+
+        check_scene(self.file)
         check_output_folder(self.output, overwrite=self.overwrite)
         if self.cameras is not None and (self.scene or self.source):
             raise UsageError("both a scene and --cameras were given; give one")
         self.prepare()
         import torch
 
-        from compgs.evaluation.scene_file import open_scene_file
-
         scene = read_scene(self.scene_source()) if self.scene or self.source else None
         views = self.given_views(scene)
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
-        model = open_scene_file(self.file, device, scene.background if scene else BLACK)
+        model = open_scene(self.file, device, scene.background if scene else BLACK)
         if self.background is not None:
-            model = replace(model, background=self.background)
+            model = model.over(self.background)
         self.render(model, views or self.way(model))
 
     def check_values(self) -> None:
@@ -133,7 +132,7 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
             raise UsageError(f"--split {self.split}: the scene has no such views")
         return [(view.name, view.camera) for view in chosen]
 
-    def way(self, model: "SceneModel") -> "Sequence[tuple[str, Camera]]":
+    def way(self, model: "Renderable") -> "Sequence[tuple[str, Camera]]":
         """Along the file's cameras, or in a circle. Raises UsageError."""
         cameras = getattr(model, "viewpoints", ())
         if self.path == "orbit" or (self.path is None and len(cameras) < 2):
@@ -144,7 +143,7 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
 
         return tour(cameras, frames=self.frames, width=self.width, height=self.height)
 
-    def circle(self, model: "SceneModel") -> "Sequence[tuple[str, Camera]]":
+    def circle(self, model: "Renderable") -> "Sequence[tuple[str, Camera]]":
         import numpy as np
 
         from compgs.evaluation.camera_path import orbit
@@ -161,7 +160,7 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
         # Around the model's own frame; cameras are given in the world's.
         return [(name, camera.moved(-np.array(model.world_offset))) for name, camera in circle]
 
-    def render(self, model: "SceneModel", views: "Sequence[tuple[str, Camera]]") -> None:
+    def render(self, model: "Renderable", views: "Sequence[tuple[str, Camera]]") -> None:
         from compgs.evaluation.camera_path import camera_entry
         from compgs.evaluation.measure import encode_png, timed_render
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from compgs.errors import ConfigError
+from compgs.errors import ConfigError, MissingDependency
 
 # Settings that have an option of their own.
 OPTIONS = {
@@ -42,7 +42,7 @@ def settings_of_options() -> Iterator[None]:
     """A ConfigError of a setting that was given on the command line becomes a UsageError of the option."""
     try:
         yield
-    except UsageError:
+    except (UsageError, MissingDependency):
         raise
     except ConfigError as error:
         raise UsageError(_of_an_option(str(error))) from error

@@ -6,6 +6,8 @@ leave one of the held-out views.
 """
 
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
+from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
 
 MAX_SIDE = 16_384  # pixels
 
@@ -147,3 +150,30 @@ def surround(positions: np.ndarray, *, width: int = 320, height: int = 240) -> l
             positions, frames=12, width=width, height=height, elevation=elevation, distance=distance
         )
     ]
+
+
+NEIGHBOURS = 3  # of a camera: nearer ones are between which others are placed
+ASIDE = 0.15  # of the distance to the nearest camera, by which those between two stand beside the line, about
+
+
+def between(cameras: Sequence[Camera], count: int, *, seed: int = 0) -> list[Camera]:
+    """`count` more cameras between neighbours of some and a little aside, looking as they do; always the same ones.
+
+    Where a few cameras stand for a capture, these stand for what lies between the few.
+    """
+    chance = np.random.default_rng(seed)
+    centers = np.stack([camera.center for camera in cameras])
+    turns = np.stack([quaternion_from_rotation(camera.rotation) for camera in cameras])
+    distances = np.linalg.norm(centers[:, None] - centers, axis=2) + np.diag(np.full(len(cameras), np.inf))
+    result = []
+    for i in range(count):
+        one = i % len(cameras)
+        near = np.argsort(distances[one], kind="stable")[: min(NEIGHBOURS, len(cameras) - 1)]
+        other = int(chance.choice(near)) if len(near) else one
+        way = chance.uniform(0.1, 0.9)
+        turn = turns[other] if turns[one] @ turns[other] >= 0 else -turns[other]
+        rotation = rotation_from_quaternion((1 - way) * turns[one] + way * turn)
+        step = distances[one].min() if len(near) else 0.0
+        center = (1 - way) * centers[one] + way * centers[other] + ASIDE * step * chance.normal(size=3)
+        result.append(replace(cameras[one], world_to_camera=rigid(rotation, -rotation @ center)))
+    return result

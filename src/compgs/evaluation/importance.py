@@ -1,4 +1,4 @@
-"""What a coupled primitive contributes to the images of a scene."""
+"""What a primitive contributes to the images of a scene."""
 
 from collections.abc import Callable, Sequence
 
@@ -7,6 +7,7 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.model.hybrid_model import HybridModel
+from compgs.model.splats import SplatModel
 from compgs.render import RasterSettings, contributions, local_camera, visible_mask
 
 
@@ -26,4 +27,18 @@ def importance(
         total[drawn] += contributions(gaussians, camera, settings).double()
         if progress:
             progress(i + 1, len(cameras))
+    return total
+
+
+def splat_importance(
+    model: SplatModel, cameras: Sequence[Camera], progress: Callable[[], None] | None = None
+) -> Tensor:  # [M] float32, pixels
+    """The same of splats; `progress()` is called after each camera."""
+    settings = RasterSettings(background=model.background)
+    total = torch.zeros_like(model.splats.opacity_logits)
+    for world_camera in cameras:
+        camera = local_camera(model, world_camera)
+        total += contributions(model.gaussians(camera), camera, settings)
+        if progress:
+            progress()
     return total

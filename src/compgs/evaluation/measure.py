@@ -17,10 +17,9 @@ from compgs.errors import SceneError
 from compgs.evaluation.camera_path import camera_entry
 from compgs.evaluation.contact_sheet import contact_sheet
 from compgs.evaluation.results import Results, ViewResult
-from compgs.evaluation.scene_file import SceneModel, component_bytes, open_scene_file
-from compgs.model.splats import SplatModel
+from compgs.formats import component_bytes, open_scene
 from compgs.outputs import check_output_folder, write_bytes, write_json
-from compgs.render import render
+from compgs.render import Renderable, render
 from compgs.scene import as_scene
 from compgs.scene.views import Scene, View
 
@@ -37,7 +36,7 @@ def evaluate(
     device: str | torch.device | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Results:
-    """Decode a .cgs file, or read a .ply file of splats, and compare its renderings with a scene's held-out views.
+    """Open a file of any known format (`compgs.formats`) and compare its renderings with a scene's held-out views.
 
     Metrics are of 8-bit images (`compgs.metrics`). A scene that is given as a folder is read as `load_scene(folder)`
     does. With `output`, a folder, `results.json` and `per_view.json` (their schema: `compgs.evaluation.results`),
@@ -94,7 +93,7 @@ def evaluate(
         height=scene.test_views[0].camera.height,
         bytes=len(data),
         components=component_bytes(path),
-        **_counts(model),
+        **{"anchors": None, "coupled_primitives": None, "splats": None, **model.counts},
         first_decode_seconds=first_seconds,
         decode_seconds=decode_seconds,
         device=device_name(chosen),
@@ -108,7 +107,7 @@ def evaluate(
     return results
 
 
-def timed_render(model: SceneModel, camera: Camera) -> tuple[np.ndarray, float]:
+def timed_render(model: Renderable, camera: Camera) -> tuple[np.ndarray, float]:
     """[H, W, 3] uint8, and the seconds it took until the image was there."""
     start = time.perf_counter()
     image = metrics.to_8bit(render(model, camera).image)
@@ -153,14 +152,7 @@ def encode_png(image: np.ndarray) -> bytes:
 
 def _timed_decode(
     path: Path, device: torch.device, background: tuple[float, float, float]
-) -> tuple[SceneModel, float]:
+) -> tuple[Renderable, float]:
     start = time.perf_counter()
-    model = open_scene_file(path, device, background)
+    model = open_scene(path, device, background)
     return model, time.perf_counter() - start
-
-
-def _counts(model: SceneModel) -> dict[str, int | None]:
-    """Of the primitives of either kind of scene; the other kind's are None."""
-    if isinstance(model, SplatModel):
-        return {"anchors": None, "coupled_primitives": None, "splats": len(model.splats)}
-    return {"anchors": model.anchors, "coupled_primitives": model.coupled, "splats": None}

@@ -13,7 +13,7 @@
 | lpips | mean over the views, or null; `lpips_note` then says why |
 | bytes | of the whole file |
 | components | bytes by component of the file; they sum to `bytes` |
-| anchors, coupled_primitives, splats | counts; null what the file does not have: splats are of .ply files |
+| anchors, coupled_primitives, splats | counts; null what the file does not have: splats are of all files but .cgs |
 | bits_per_anchor, bits_per_coupled_primitive, bits_per_splat | all bits of the file by each count, or null |
 | first_decode_seconds, decode_seconds | file to model: first in a process (loads kernels); again |
 | render_seconds | median over the views, after one view to warm up |

@@ -1,8 +1,8 @@
 """A scene that can be rendered: what a decoded file holds, and what training hands over."""
 
 import functools
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -59,6 +59,18 @@ class HybridModel:
     def coupled(self) -> int:
         """Number of coupled primitives in the scene."""
         return len(self.primitives.residuals)
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        return {"anchors": self.anchors, "coupled_primitives": self.coupled}
+
+    @property
+    def most_gaussians(self) -> int:
+        return self.coupled
+
+    def over(self, background: tuple[float, float, float]) -> "HybridModel":
+        """The same over another background."""
+        return replace(self, background=background)
 
     @functools.cached_property
     def first_coupled(self) -> Tensor:

@@ -1,11 +1,12 @@
-"""Independent splats with view-dependent color: what plain 3DGS trains and what .ply files hold (Kerbl et al. 2023).
+"""Independent splats with view-dependent color: what plain 3DGS and files of splats hold (Kerbl et al. 2023).
 
 `Splats` are the stored, unactivated numbers; `splat_gaussians` activates them for a camera; `SplatModel` is a scene of
 them that can be rendered.
 """
 
 import functools
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -67,7 +68,7 @@ def splat_radii(splats: Splats) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SplatModel:
-    """A scene of splats; `gaussians(camera)` is what a view renders. A .ply file does not know its background.
+    """A scene of splats; `gaussians(camera)` is what a view renders. Only .cgs files hold a background.
 
     Splats and the cameras of `gaussians` are in the local frame, world coordinates minus `world_offset`;
     `compgs.render` takes cameras of the world and moves them.
@@ -77,6 +78,18 @@ class SplatModel:
     background: tuple[float, float, float]  # RGB, 0 to 1
     # world units, float64: origin of the local frame
     world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        return {"splats": len(self.splats)}
+
+    @property
+    def most_gaussians(self) -> int:
+        return len(self.splats)
+
+    def over(self, background: tuple[float, float, float]) -> "SplatModel":
+        """The same over another background."""
+        return replace(self, background=background)
 
     @functools.cached_property
     def bounds(self) -> tuple[Tensor, Tensor]:
@@ -89,3 +102,7 @@ class SplatModel:
         if visible is None:
             return splat_gaussians(self.splats, camera)
         return splat_gaussians(self.splats.rows(torch.nonzero(visible).view(-1)), camera)
+
+    def parts(self, camera: Camera, visible: Tensor | None = None) -> Iterator[Gaussians]:
+        """The same, as one part: splats are in memory anyway."""
+        yield self.gaussians(camera, visible)

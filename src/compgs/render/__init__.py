@@ -6,7 +6,7 @@ from typing import Any
 
 from compgs.render.contributions import contributions
 from compgs.render.rasterize import rasterize
-from compgs.render.render_model import local_camera, render
+from compgs.render.render_model import Renderable, local_camera, render
 from compgs.render.result import RasterResult
 from compgs.render.settings import RasterSettings
 from compgs.render.visibility import visible_mask
@@ -14,6 +14,7 @@ from compgs.render.visibility import visible_mask
 __all__ = [
     "RasterResult",
     "RasterSettings",
+    "Renderable",
     "contributions",
     "local_camera",
     "rasterize",

@@ -1,14 +1,16 @@
 """The public face of rendering: a decoded or trained scene, seen from a camera."""
 
 import functools
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Iterator, Mapping
+from typing import Protocol, runtime_checkable
 
 import torch
+from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.errors import ConfigError
 from compgs.gaussians import Gaussians
-from compgs.render.rasterize import rasterize, rasterize_parts
+from compgs.render.rasterize import rasterize_parts
 from compgs.render.result import RasterResult
 from compgs.render.settings import RasterSettings
 from compgs.render.visibility import visible_mask
@@ -16,22 +18,52 @@ from compgs.render.visibility import visible_mask
 
 @runtime_checkable
 class Renderable(Protocol):
-    """Anything that says which Gaussians a camera sees.
+    """A scene: says which Gaussians a camera sees. What a decoder, a reader of a file or a training gives.
 
-    A model with `bounds` (centres [N, 3] and radii [N] of its anchors) is asked for the anchors in view only,
-    as `gaussians(camera, visible)`; one that also has `parts` for what they have, at most `coupled`, a part at a time.
-    A model with a `world_offset` (3 numbers, world units) is asked in its local frame, world minus offset.
+    Everything is in the model's local frame, world coordinates minus `world_offset`.
     """
 
     @property
-    def background(self) -> tuple[float, float, float]: ...
+    def background(self) -> tuple[float, float, float]:
+        """RGB, 0 to 1."""
+        ...
 
-    def gaussians(self, camera: Camera) -> Gaussians: ...
+    @property
+    def world_offset(self) -> tuple[float, float, float]:
+        """World units, float64: origin of the local frame."""
+        ...
+
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Spheres that hold all that is drawn of a unit (anchor, splat): centres [N, 3] and radii [N], world units."""
+        ...
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """What there is how many of, by the names of `Results`: `splats`, or `anchors` and `coupled_primitives`."""
+        ...
+
+    @property
+    def most_gaussians(self) -> int:
+        """That a camera can see."""
+        ...
+
+    def over(self, background: tuple[float, float, float]) -> "Renderable":
+        """The same over another background."""
+        ...
+
+    def gaussians(self, camera: Camera, visible: Tensor | None = None) -> Gaussians:
+        """What a camera sees of the units of a mask [N] bool, or of all."""
+        ...
+
+    def parts(self, camera: Camera, visible: Tensor | None = None) -> Iterator[Gaussians]:
+        """The same, a part at a time, so that not all need be in memory; one part at least."""
+        ...
 
 
-def local_camera(model: Any, camera: Camera) -> Camera:
+def local_camera(model: Renderable, camera: Camera) -> Camera:
     """A camera of the world in the model's own frame, moved in double precision: where the two meet."""
-    return _moved(camera, getattr(model, "world_offset", (0.0, 0.0, 0.0)))
+    return _moved(camera, model.world_offset)
 
 
 @functools.lru_cache(maxsize=4096)
@@ -64,11 +96,6 @@ def render(
         )
     camera = local_camera(model, camera)
     settings = settings or RasterSettings(background=model.background)
-    bounds = getattr(model, "bounds", None)
-    if bounds is None:
-        return rasterize(model.gaussians(camera), camera, settings)
-    centers, radii = bounds
+    centers, radii = model.bounds
     visible = visible_mask(centers, radii, camera, settings)
-    if hasattr(model, "parts"):
-        return rasterize_parts(model.parts(camera, visible), model.coupled, camera, settings)  # type: ignore[attr-defined]
-    return rasterize(model.gaussians(camera, visible), camera, settings)  # type: ignore[call-arg]
+    return rasterize_parts(model.parts(camera, visible), model.most_gaussians, camera, settings)

@@ -69,7 +69,7 @@ def train_splats(
     device: str | torch.device | None = None,
     profile: StepProfile | None = None,
 ) -> SplatModel:
-    """Train plain 3DGS on a scene; the result is ready for `compgs.export.write_ply`. Arguments as of `train`.
+    """Train plain 3DGS on a scene; the result is ready for `compgs.formats.write_ply`. Arguments as of `train`.
 
     Of the settings, `splats` applies, and of `training` the steps, the seed, the loss and the checkpoints.
 

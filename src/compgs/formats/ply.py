@@ -15,20 +15,27 @@ vertices); what it needs must be there, in single or double precision, finite, a
 """
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from compgs.errors import SplatFileError
-from compgs.model.spherical_harmonics import MAX_DEGREE, coefficients
-from compgs.model.splats import Splats
+from compgs.formats.arrays import (
+    MAX_DEGREE,
+    MAX_LOG_SCALE,
+    ORIGIN,
+    SplatArrays,
+    arrays_of,
+    harmonics_above_dc,
+)
 from compgs.outputs import check_output_file, write_bytes
 
+if TYPE_CHECKING:
+    from compgs.model.splats import Splats
+
 MAX_HEADER_BYTES = 1 << 16
-MAX_LOG_SCALE = 88.0  # its exponential is the largest that float32 holds
 _FORMAT = "format binary_little_endian 1.0"
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -54,7 +61,7 @@ def property_groups(degree: int) -> dict[str, tuple[str, ...]]:
         "positions": ("x", "y", "z"),
         "normals": ("nx", "ny", "nz"),
         "colors": numbered("f_dc", 3),
-        "harmonics": numbered("f_rest", 3 * (coefficients(degree) - 1)),
+        "harmonics": numbered("f_rest", 3 * harmonics_above_dc(degree)),
         "opacities": ("opacity",),
         "scales": numbered("scale", 3),
         "rotations": numbered("rot", 4),
@@ -76,10 +83,10 @@ class PlyHeader:
 
 
 def write_ply(
-    splats: Splats,
+    splats: "Splats",
     path: str | Path,
     *,
-    world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),  # world units: origin of the splats' frame
+    world_offset: tuple[float, float, float] = ORIGIN,  # world units: origin of the splats' frame
     overwrite: bool = False,
 ) -> int:
     """Write splats, whole or not at all; the number of bytes. Raises OutputError.
@@ -87,23 +94,32 @@ def write_ply(
     Positions in the file are world coordinates, `means + world_offset`, as float32, for that is what other programs
     expect: of a scene 4 000 km from its origin they are whole multiples of 0.25 to 0.5 m.
     """
-    data = ply_bytes(splats, world_offset)
+    data = encoded(arrays_of(splats, world_offset))
     check_output_file(Path(path), overwrite=overwrite, needed_bytes=len(data))
     write_bytes(Path(path), data)
     return len(data)
 
 
-def ply_bytes(splats: Splats, world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bytes:
+def encoded(arrays: SplatArrays) -> bytes:
     """The content of the file; see `write_ply`."""
-    if any(world_offset):
-        means = splats.means.detach().cpu().double()
-        splats = replace(splats, means=means + means.new_tensor(world_offset))
-    names = [name for group in property_groups(splats.degree).values() for name in group]
-    table = np.zeros((len(splats), len(names)), "<f4")
-    for columns, tensor in _columns(splats):
-        first = names.index(columns[0]) if columns else 0
-        table[:, first : first + len(columns)] = tensor.detach().cpu().numpy()
-    return _header_text(len(splats), names) + table.tobytes()
+    means = arrays.means
+    if any(arrays.world_offset):
+        means = means.astype(np.float64) + np.array(arrays.world_offset)
+    names = [name for group in property_groups(arrays.degree).values() for name in group]
+    table = np.zeros((len(arrays), len(names)), "<f4")
+    groups = property_groups(arrays.degree)
+    content = {
+        "positions": means,
+        "colors": arrays.dc,
+        "harmonics": arrays.rest.transpose(0, 2, 1).reshape(len(arrays), -1),
+        "opacities": arrays.opacity_logits[:, None],
+        "scales": arrays.log_scales,
+        "rotations": arrays.quaternions,
+    }
+    for group, values in content.items():
+        first = names.index(groups[group][0]) if groups[group] else 0
+        table[:, first : first + len(groups[group])] = values
+    return _header_text(len(arrays), names) + table.tobytes()
 
 
 def ply_size(count: int, degree: int) -> int:
@@ -117,53 +133,66 @@ def _header_text(count: int, names: list[str]) -> bytes:
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
-def _columns(splats: Splats) -> list[tuple[tuple[str, ...], Tensor]]:
-    """Names and values [M, ...] of everything that a file holds but the normals."""
-    groups = property_groups(splats.degree)
-    return [
-        (groups["positions"], splats.means),
-        (groups["colors"], splats.dc),
-        (groups["harmonics"], splats.rest.transpose(1, 2).reshape(len(splats), -1)),
-        (groups["opacities"], splats.opacity_logits[:, None]),
-        (groups["scales"], splats.log_scales),
-        (groups["rotations"], splats.quaternions),
-    ]
-
-
 # reading -----------------------------------------------------------------------------------------------------------
 
 
-def read_ply(path: str | Path) -> Splats:
+def begins(head: bytes) -> bool:
+    """Whether a file begins as a .ply does."""
+    return head.startswith((b"ply\n", b"ply\r\n"))
+
+
+def check(path: Path) -> None:
+    """Raises SplatFileError for what can be known without reading the splats."""
+    read_ply_header(path)
+
+
+def read_ply(path: str | Path) -> "Splats":
     """Inverse of `write_ply`. Raises SplatFileError, naming the first thing that is wrong."""
-    path = Path(path)
+    return read(Path(path)).splats()
+
+
+def read(path: Path) -> SplatArrays:
+    """Raises SplatFileError."""
     header = read_ply_header(path)
     table = np.memmap(path, header.row, "r", header.start, (header.count,))
     groups = property_groups(header.degree)
 
-    def values(group: str) -> Tensor:
+    def values(group: str) -> np.ndarray:
         names = groups[group]
         array = np.empty((header.count, len(names)), np.float32)
         with np.errstate(over="ignore"):  # a double that is too large becomes infinite, and is refused
             for i, name in enumerate(names):
                 array[:, i] = table[name]
                 _check_numbers(path, name, array[:, i])
-        return torch.from_numpy(array)
+        return array
 
     log_scales, quaternions = values("scales"), values("rotations")
-    zero = torch.nonzero(~quaternions.any(1)).view(-1)
+    zero = np.flatnonzero(~quaternions.any(1))
     if len(zero):
         raise SplatFileError(
-            f"{path}: rot_0 to rot_3 of splat {int(zero[0])} are all zero, which is no rotation; {_REMEDY}"
+            f"{path}: rot_0 to rot_3 of splat {zero[0]} are all zero, which is no rotation; {_REMEDY}"
         )
-    harmonics = values("harmonics").view(header.count, 3, coefficients(header.degree) - 1)
-    return Splats(
+    harmonics = values("harmonics").reshape(header.count, 3, harmonics_above_dc(header.degree))
+    return SplatArrays(
         means=values("positions"),
         log_scales=log_scales,
         quaternions=quaternions,
-        opacity_logits=values("opacities")[:, 0].contiguous(),
+        opacity_logits=values("opacities")[:, 0].copy(),
         dc=values("colors"),
-        rest=harmonics.transpose(1, 2).contiguous(),
+        rest=np.ascontiguousarray(harmonics.transpose(0, 2, 1)),
     )
+
+
+def component_bytes(path: Path) -> dict[str, int]:
+    """Bytes of each component of a file; they sum to its size."""
+    header = read_ply_header(path)
+    names = header.row.names or ()
+    groups = {name: group for group, held in property_groups(header.degree).items() for name in held}
+    sizes = dict.fromkeys(dict.fromkeys(["header", *(groups.get(name, "others") for name in names)]), 0)
+    for name in names:
+        sizes[groups.get(name, "others")] += header.count * header.row[name].itemsize
+    sizes["header"] = header.bytes - sum(sizes.values())
+    return sizes
 
 
 def read_ply_header(path: str | Path) -> PlyHeader:
@@ -177,7 +206,7 @@ def read_ply_header(path: str | Path) -> PlyHeader:
         raise SplatFileError(f"{path}: cannot be read ({error.strerror or error})") from error
     end = begin.find(b"end_header")
     newline = begin.find(b"\n", end)
-    if not begin.startswith((b"ply\n", b"ply\r\n")):
+    if not begins(begin):
         raise SplatFileError(f"{path}: does not begin as a .ply file does")
     if end < 0 or newline < 0:
         raise SplatFileError(f"{path}: the header does not end within {MAX_HEADER_BYTES} bytes")
@@ -230,7 +259,7 @@ def _degree(path: Path, row: np.dtype) -> int:
     """Of the harmonics, from the number of f_rest; every property that is needed must be there."""
     found = set(row.names or ())
     held = sum(name.startswith("f_rest_") for name in found)
-    degrees = {3 * (coefficients(d) - 1): d for d in range(MAX_DEGREE + 1)}
+    degrees = {3 * harmonics_above_dc(d): d for d in range(MAX_DEGREE + 1)}
     if held not in degrees:
         raise SplatFileError(
             f"{path}: {held} properties f_rest_*; expected {', '.join(map(str, degrees))} (degree 0 to 3)"

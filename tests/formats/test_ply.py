@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from compgs.errors import OutputError, SplatFileError
-from compgs.export import read_ply, write_ply
-from compgs.export.ply import ply_size, read_ply_header
+from compgs.formats import read_ply, write_ply
+from compgs.formats.ply import ply_size, read_ply_header
 from compgs.model.splats import Splats
 
 REAL = Path(__file__).parents[3] / "shared" / "splats"

@@ -1,0 +1,101 @@
+"""`compgs export`: a scene for other programs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument
+from compgs.cli.console import say, size
+from compgs.cli.progress import counting
+from compgs.cli.sizes import parse_size
+from compgs.cli.usage import check_range, settings_of_options
+
+if TYPE_CHECKING:
+    from compgs.exporting import Exported
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(ComputingCommand, SceneFileArgument):
+    """Write a scene as plain splats (.ply, .spz, .sog, .glb), or as a web page that shows it (.html).
+
+    In a .cgs file opacity and color depend on where one stands; other programs know harmonics. They are fitted
+    over the cameras that the file holds, and what that costs is measured: the new file is read again and its
+    pictures are compared with those of the scene. Files of splats of any kind are converted, too.
+
+    Examples
+
+    compgs export garden.cgs garden.spz
+
+    compgs export garden.cgs garden.sog --max-bytes 2MB
+
+    compgs export garden.ply garden.glb
+    """
+
+    output: Annotated[Positional[Path], arg(metavar="OUT")]
+    """The file to write; what it becomes is said by what its name ends in."""
+
+    degree: Annotated[int, arg(metavar="N")] = 3
+    """Of the harmonics, 0 to 3: 0 is the same color from everywhere, and a quarter of a .ply's bytes."""
+
+    refine: Annotated[int, arg(metavar="STEPS")] = 100
+    """Steps in which baked splats are fitted to the scene's own pictures; 0 is faster."""
+
+    max_splats: Annotated[int | None, arg(metavar="N", help_behavior_hint=NO_DEFAULT)] = None
+    """Keep those splats that contribute most to the pictures."""
+
+    max_bytes: Annotated[str | None, arg(metavar="SIZE", help_behavior_hint=NO_DEFAULT)] = None
+    """Keep as many as fit into a file of this size, such as 2MB or 500kB."""
+
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace OUT if it is there already."""
+
+    def run(self) -> None:
+        check_range("--degree", self.degree, 0, 3)
+        check_range("--refine", self.refine, 0, 100_000)
+        most = None if self.max_bytes is None else parse_size(self.max_bytes, "--max-bytes")
+        from compgs.formats import check_scene
+
+        check_scene(self.file)
+        self.prepare()
+        from compgs.exporting import export
+
+        with settings_of_options(), counting("baking and comparing") as progress:
+            exported = export(
+                self.file,
+                self.output,
+                degree=self.degree,
+                refine=self.refine,
+                max_splats=self.max_splats,
+                max_bytes=most,
+                overwrite=self.overwrite,
+                device=self.device,
+                progress=progress,
+            )
+        for line in report(self.file, self.output, exported, self.degree):
+            say(line)
+
+
+def report(source: Path, path: Path, exported: "Exported", degree: int) -> list[str]:
+    """What was written, and what it costs, in words."""
+    if exported.splats is None:
+        return [f"{path}: {size(exported.bytes)}, a page that shows {source.name} without anything else"]
+    lines = [f"{path}: {size(exported.bytes)} ({exported.bytes:,} bytes), {exported.splats:,} splats"]
+    if exported.worst == float("inf"):
+        lines.append(f"its pictures are those of {source.name}, from {len(exported.psnr)} cameras")
+    else:
+        lines.append(
+            f"beside {source.name}: {exported.mean:.2f} dB, {exported.worst:.2f} dB from the worst of "
+            f"{len(exported.psnr)} cameras"
+        )
+    if exported.dropped:
+        total = exported.splats + exported.dropped
+        advice = "; a lower --degree leaves room for more of them" if degree else ""
+        lines.append(f"{exported.dropped:,} of {total:,} splats were left out{advice}")
+    if any(exported.origin):
+        place = " ".join(f"{x:.12g}" for x in exported.origin)
+        lines.append(
+            f"note: positions count from {place}: {path.suffix} has no place for that; .ply and .glb do"
+        )
+    return lines

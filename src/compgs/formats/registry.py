@@ -1,0 +1,128 @@
+"""Which formats there are: a file is known by its first bytes, never by its name; what is written, by its name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from compgs.errors import NotACompGSFile, OutputError, SplatFileError
+from compgs.formats import cgs, glb, ply, sog, splat, spz
+from compgs.formats.arrays import SplatArrays
+
+if TYPE_CHECKING:
+    import torch
+
+    from compgs.render.render_model import Renderable
+
+HEAD_BYTES = 1 << 12  # enough to tell the formats apart
+Background = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Format:
+    """What can be done with files of one kind."""
+
+    name: str  # as its suffix, without the dot
+    begins: Callable[[bytes], bool]  # whether the first bytes are those of such a file
+    check: Callable[[Path], None]  # raises for what can be known without reading everything
+    component_bytes: Callable[[Path], dict[str, int]]  # by component; they sum to the file's size
+    open: "Callable[[Path, torch.device | str, Background], Renderable]"
+
+
+def _opens_splats(
+    read: Callable[[Path], SplatArrays],
+) -> "Callable[[Path, torch.device | str, Background], Renderable]":
+    def open_splats(path: Path, device: "torch.device | str", background: Background) -> "Renderable":
+        from compgs.model.splats import SplatModel
+
+        arrays = read(path)
+        return SplatModel(arrays.splats().to(device), background, arrays.world_offset)
+
+    return open_splats
+
+
+def _open_cgs(path: Path, device: "torch.device | str", background: Background) -> "Renderable":
+    return cgs.read(path, device)
+
+
+# In the order in which they are asked; .splat, which nothing marks, is the last.
+FORMATS = (
+    Format("cgs", cgs.begins, cgs.check, cgs.component_bytes, _open_cgs),
+    Format("ply", ply.begins, ply.check, ply.component_bytes, _opens_splats(ply.read)),
+    Format("spz", spz.begins, spz.check, spz.component_bytes, _opens_splats(spz.read)),
+    Format("sog", sog.begins, sog.check, sog.component_bytes, _opens_splats(sog.read)),
+    Format("glb", glb.begins, glb.check, glb.component_bytes, _opens_splats(glb.read)),
+    Format("splat", splat.begins, splat.check, splat.component_bytes, _opens_splats(splat.read)),
+)
+
+# Content of a file of splats, by what the name ends in. `spz` is version 3, which needs nothing to be installed.
+WRITERS: dict[str, Callable[[SplatArrays], bytes]] = {
+    "ply": ply.encoded,
+    "spz": spz.encoded,
+    "sog": sog.encoded,
+    "glb": glb.encoded,
+}
+# Formats that say where positions count from, or whose positions are of the world.
+KEEP_WORLD_OFFSET = ("ply", "glb")
+
+
+def format_of(path: Path) -> Format:
+    """Of a file that is there. Raises NotACompGSFile for one that is of no known format, or is no file."""
+    names = ", ".join(f".{each.name}" for each in FORMATS[1:])
+    if path.is_dir():
+        files = sorted(path.glob("*.cgs")) or sorted(path.glob("meta.json"))
+        hint = f"; did you mean {files[0]}?" if files else ""
+        raise NotACompGSFile(f"{path}: expected a .cgs file or one of {names}, found a folder{hint}")
+    if not path.is_file():
+        raise NotACompGSFile(f"{path}: there is no such file")
+    try:
+        with open(path, "rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError as error:
+        raise NotACompGSFile(f"{path}: cannot be read ({error.strerror})") from error
+    found = next((each for each in FORMATS if each.begins(head)), None)
+    if found is None:
+        what = f"is not a .cgs file, nor one of {names}" if head else "is empty"
+        raise NotACompGSFile(f"{path}: {what}")
+    return found
+
+
+def check_scene(path: str | Path) -> None:
+    """Raises BitstreamError, SplatFileError if there is no whole file to read, before anything is decoded."""
+    path = Path(path)
+    format_of(path).check(path)
+
+
+def open_scene(
+    path: str | Path,
+    device: "torch.device | str" = "cpu",
+    background: Background = (
+        0.0,
+        0.0,
+        0.0,
+    ),  # RGB, 0 to 1, where the file does not know its own: all but .cgs
+) -> "Renderable":
+    """A scene that can be rendered, of any format. Raises BitstreamError, SplatFileError, MissingDependency."""
+    path = Path(path)
+    return format_of(path).open(path, device, background)
+
+
+def component_bytes(path: str | Path) -> dict[str, int]:
+    """Bytes of each component of a file; they sum to its size. Raises as `open_scene` does."""
+    path = Path(path)
+    return format_of(path).component_bytes(path)
+
+
+def writer_of(path: Path) -> str:
+    """The format that a name asks for, a key of `WRITERS`. Raises OutputError."""
+    name = path.suffix.lower().removeprefix(".")
+    if name not in WRITERS:
+        raise OutputError(f"{path}: expected a name that ends in {', '.join(f'.{each}' for each in WRITERS)}")
+    return name
+
+
+def encoded(arrays: SplatArrays, name: str) -> bytes:
+    """Content of a file of one of `WRITERS`. Raises SplatFileError for what the format cannot hold."""
+    if not len(arrays):
+        raise SplatFileError(f".{name}: there are no splats to write")
+    return WRITERS[name](arrays)

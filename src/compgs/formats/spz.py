@@ -1,0 +1,351 @@
+"""Splats as an .spz file (Niantic): quantized columns, compressed; about a tenth of a .ply.
+
+    version 2, 3    gzip( header | columns )
+    version 4       header | extensions | table | columns, each a Zstandard frame
+
+| header field | bytes | what |
+|---|---|---|
+| magic | 4 | "NGSP" |
+| version | 4 | 2, 3 or 4 |
+| count | 4 | splats |
+| degree | 1 | of the harmonics, 0 to 3 here |
+| fractional bits | 1 | of positions |
+| flags | 1 | 1: trained with antialiasing; 2: extensions are there, which are skipped |
+| streams | 1 | columns in the table; 0 before version 4 |
+| table offset | 4 | version 4 only, then 12 bytes of zero; an entry is two uint64: packed, unpacked bytes |
+
+| column | bytes a splat | value |
+|---|---|---|
+| positions | 9 | signed 24 bits / 2^fractional bits |
+| opacities | 1 | / 255 |
+| colors | 3 | coefficient of degree 0 = (byte / 255 - 1/2) / 0.15 |
+| scales | 3 | log scale = byte / 16 - 10 |
+| rotations | 4 | x-y-z-w without the largest, each a sign and 9 bits of 1/sqrt(2); at the top 2 bits: which |
+| | 3 | version 2: x, y, z = byte / 127.5 - 1, w >= 0 |
+| harmonics | 9, 24, 45 | (byte - 128) / 128; coefficient by coefficient, red green blue |
+
+Little endian. Axes are right, up, back. There is no place for where positions count from: they are written as they
+are, in the model's own frame.
+"""
+
+import gzip
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compgs.errors import MissingDependency, SplatFileError, install_line
+from compgs.formats.arrays import (
+    MAX_DEGREE,
+    SplatArrays,
+    check_count,
+    checked,
+    harmonics_above_dc,
+    logit,
+    normalized,
+)
+from compgs.formats.frames import RIGHT_UP_BACK, turned
+
+MAGIC = b"NGSP"
+GZIP_MAGIC = b"\x1f\x8b"
+VERSIONS = (2, 3, 4)
+WRITTEN_VERSIONS = (3, 4)
+HAS_EXTENSIONS = 2
+_HEADER = struct.Struct("<4sIIBBBB")
+_LONG_HEADER = struct.Struct("<4sIIBBBBI12x")
+_TABLE_ENTRY = struct.Struct("<QQ")
+_MOST_EXTENSION_BYTES = 1 << 20
+
+COLOR_SCALE = 0.15
+SCALE_STEPS, SCALE_START = 16.0, -10.0
+POSITION_LIMIT = (1 << 23) - 1  # of 24 bits with a sign
+MOST_FRACTIONAL_BITS = 24
+# Positions are as fine as this part of the median splat: farther digits are noise that costs bytes.
+STEP_OF_SCALE = 1 / 16
+# Kept bits of 8: the others are zero, which compresses. Of a baked scene 7 and 6 are 44 dB from it; 5 and 4, which
+# other programs write, are 38 dB and three quarters of the bytes; 8 and 8 are 46 dB and 1.4 times the bytes.
+HARMONIC_BITS = (7, 6)  # of degree 1; of degrees 2 and 3
+_SQRT_HALF = 2**-0.5
+_SMALLEST_THREE_STEPS = 511
+
+
+@dataclass(frozen=True)
+class SpzHeader:
+    """What a file says of itself."""
+
+    version: int
+    count: int  # splats
+    degree: int
+    fractional_bits: int
+    flags: int
+    streams: int
+    table_offset: int  # bytes; of version 4
+
+    @property
+    def columns(self) -> dict[str, int]:
+        """Bytes a splat of each column, in the order of the file."""
+        return columns_of(self.version, self.degree)
+
+
+def columns_of(version: int, degree: int) -> dict[str, int]:
+    sizes = {"positions": 9, "opacities": 1, "colors": 3, "scales": 3, "rotations": 3 if version == 2 else 4}
+    return {**sizes, "harmonics": 3 * harmonics_above_dc(degree)} if degree else sizes
+
+
+# writing -----------------------------------------------------------------------------------------------------------
+
+
+def encoded(arrays: SplatArrays, version: int = 3) -> bytes:
+    """The content of a file of version 3 or 4. Raises MissingDependency (4, without a Zstandard module), SplatFileError
+    for splats that lie too far from the origin for 24 bits."""
+    assert version in WRITTEN_VERSIONS, version
+    arrays = turned(arrays, RIGHT_UP_BACK)
+    bits = fractional_bits(arrays)
+    degree = arrays.degree
+    columns = [
+        _packed_positions(arrays.means, bits),
+        np.rint(255 * arrays.opacities),
+        np.clip(np.rint(255 * (COLOR_SCALE * arrays.dc + 0.5)), 0, 255),
+        np.clip(np.rint(SCALE_STEPS * (arrays.log_scales - SCALE_START)), 0, 255),
+        _packed_rotations(arrays.quaternions),
+        _packed_harmonics(arrays.rest),
+    ][: len(columns_of(version, degree))]
+    data = [column.astype(np.uint8).tobytes() for column in columns]
+    if version < 4:
+        header = _HEADER.pack(MAGIC, version, len(arrays), degree, bits, 0, 0)
+        return gzip.compress(header + b"".join(data), compresslevel=9, mtime=0)
+    compress = _zstandard()[0]
+    packed = [compress(column) for column in data]
+    header = _LONG_HEADER.pack(MAGIC, version, len(arrays), degree, bits, 0, len(data), _LONG_HEADER.size)
+    table = b"".join(_TABLE_ENTRY.pack(len(p), len(d)) for p, d in zip(packed, data, strict=True))
+    return header + table + b"".join(packed)
+
+
+def fractional_bits(arrays: SplatArrays) -> int:
+    """As many as the splats are fine, and as their distance from the origin leaves. Raises SplatFileError."""
+    reach = float(np.abs(arrays.means).max())
+    middle = float(np.median(np.sort(arrays.log_scales, axis=1)[:, 1]))
+    wanted = int(np.ceil(-np.log2(STEP_OF_SCALE) - middle / np.log(2)))
+    room = int(np.floor(np.log2(POSITION_LIMIT / max(reach, 1e-30))))
+    if room < 0:
+        raise SplatFileError(
+            f".spz: positions reach {reach:g} world units from the origin, its 24 bits at most {POSITION_LIMIT}; "
+            "write .ply or .glb"
+        )
+    return max(0, min(wanted, room, MOST_FRACTIONAL_BITS))
+
+
+def _packed_positions(means: np.ndarray, bits: int) -> np.ndarray:
+    whole = np.clip(np.rint(means.astype(np.float64) * 2.0**bits), -POSITION_LIMIT, POSITION_LIMIT)
+    words = np.ascontiguousarray(whole.astype("<i4"))
+    return words.view(np.uint8).reshape(len(means), 3, 4)[:, :, :3]
+
+
+def _packed_rotations(quaternions: np.ndarray) -> np.ndarray:
+    """[M, 4] bytes: the three smaller parts, as far as a sign and nine bits say them."""
+    xyzw = np.roll(normalized(quaternions), -1, axis=1)
+    largest = np.abs(xyzw).argmax(1)
+    xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -1, 1)
+    steps = np.minimum(
+        np.floor(_SMALLEST_THREE_STEPS * np.abs(xyzw) / _SQRT_HALF + 0.5), _SMALLEST_THREE_STEPS
+    )
+    parts = steps.astype(np.uint32) | np.where(xyzw < 0, 1 << 9, 0).astype(np.uint32)
+    words = largest.astype(np.uint32)
+    for i in range(4):
+        words = np.where(largest == i, words, (words << np.uint32(10)) | parts[:, i])
+    return words.astype("<u4")[:, None].view(np.uint8)
+
+
+def _packed_harmonics(rest: np.ndarray) -> np.ndarray:
+    bits = np.where(np.arange(rest.shape[1]) < harmonics_above_dc(1), *HARMONIC_BITS)[:, None]
+    step = 2.0 ** (8 - bits)
+    # Whole steps of the byte, around its middle, so that zero stays zero.
+    return np.clip(128 + step * np.rint(128 * rest / step), 0, 255)
+
+
+# reading -----------------------------------------------------------------------------------------------------------
+
+
+def begins(head: bytes) -> bool:
+    """Whether a file begins as an .spz does; of a gzip file, its first bytes are unpacked."""
+    if not head.startswith(GZIP_MAGIC):
+        return head.startswith(MAGIC)
+    try:
+        return zlib.decompressobj(wbits=31).decompress(head, len(MAGIC)) == MAGIC
+    except zlib.error:
+        return False
+
+
+def check(path: Path) -> None:
+    """Raises SplatFileError for what can be known without unpacking the splats."""
+    _header(path, path.read_bytes())
+
+
+def read(path: Path) -> SplatArrays:
+    """Raises SplatFileError, MissingDependency (version 4, without a Zstandard module)."""
+    data = path.read_bytes()
+    header = _header(path, data)
+    columns = _long_columns(path, header, data) if header.version == 4 else _gzip_columns(path, header, data)
+    arrays = {
+        name: np.frombuffer(column, np.uint8).reshape(header.count, -1)
+        for name, column in zip(header.columns, columns, strict=True)
+    }
+    rotations = arrays["rotations"]
+    count, coefficients = header.count, harmonics_above_dc(header.degree)
+    rest = arrays.get("harmonics", np.zeros((count, 0), np.uint8)).reshape(count, coefficients, 3)
+    found = SplatArrays(
+        means=_positions(arrays["positions"], header.fractional_bits),
+        log_scales=arrays["scales"] / np.float32(SCALE_STEPS) + np.float32(SCALE_START),
+        quaternions=_short_rotations(rotations) if header.version == 2 else _rotations(rotations),
+        opacity_logits=logit(arrays["opacities"][:, 0] / 255),
+        dc=((arrays["colors"] / 255 - 0.5) / COLOR_SCALE).astype(np.float32),
+        rest=(rest.astype(np.float32) - 128) / 128,
+    )
+    return turned(checked(path, found), RIGHT_UP_BACK)
+
+
+def component_bytes(path: Path) -> dict[str, int]:
+    """Bytes of each component of a file; they sum to its size. Before version 4 all columns are one."""
+    data = path.read_bytes()
+    header = _header(path, data)
+    if header.version < 4:
+        return {"splats": len(data)}
+    sizes = [packed for packed, _ in _table(path, header, data)]
+    return {"header": len(data) - sum(sizes), **dict(zip(header.columns, sizes, strict=True))}
+
+
+def _header(path: Path, data: bytes) -> SpzHeader:
+    """Checked against the size of the file."""
+    compressed = data.startswith(GZIP_MAGIC)
+    layout = _HEADER if compressed else _LONG_HEADER
+    try:
+        begin = (
+            zlib.decompressobj(wbits=31).decompress(data, layout.size) if compressed else data[: layout.size]
+        )
+    except zlib.error as error:
+        raise SplatFileError(f"{path}: is damaged ({error}); copy it again") from error
+    if len(begin) < layout.size or not begin.startswith(MAGIC):
+        raise SplatFileError(f"{path}: does not begin as an .spz file does, or ends within its header")
+    header = SpzHeader(*(*layout.unpack(begin), 0)[1:8])
+    if header.version not in VERSIONS or (header.version == 4) == compressed:
+        kind = "inside gzip" if compressed else "outside gzip"
+        raise SplatFileError(f"{path}: version {header.version} {kind}; expected 2 or 3 inside, or 4 outside")
+    if header.degree > MAX_DEGREE:
+        raise SplatFileError(f"{path}: harmonics of degree {header.degree}; expected 0 to {MAX_DEGREE}")
+    if header.fractional_bits > MOST_FRACTIONAL_BITS:
+        raise SplatFileError(
+            f"{path}: {header.fractional_bits} fractional bits; expected 0 to {MOST_FRACTIONAL_BITS}"
+        )
+    check_count(path, header.count, len(data))
+    if header.version == 4:
+        _table(path, header, data)
+    return header
+
+
+def _gzip_columns(path: Path, header: SpzHeader, data: bytes) -> list[bytes]:
+    sizes = [header.count * size for size in header.columns.values()]
+    promised = _HEADER.size + sum(sizes)
+    most = promised + (_MOST_EXTENSION_BYTES if header.flags & HAS_EXTENSIONS else 0)
+    unpacker = zlib.decompressobj(wbits=31)
+    try:
+        # One byte more than there may be: a file that has more is not unpacked to its end.
+        content = unpacker.decompress(data, most + 1)
+    except zlib.error as error:
+        raise SplatFileError(f"{path}: is damaged ({error}); copy it again") from error
+    if not promised <= len(content) <= most or not unpacker.eof or unpacker.unused_data:
+        found = f"more than {most}" if len(content) > most else str(len(content))
+        raise SplatFileError(
+            f"{path}: {header.count} splats are {promised} bytes unpacked, the file holds {found}; copy it again"
+        )
+    ends = _HEADER.size + np.cumsum(sizes)
+    return [content[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+
+
+def _table(path: Path, header: SpzHeader, data: bytes) -> list[tuple[int, int]]:
+    """Packed and unpacked bytes of each column, which together fill the file."""
+    if header.streams != len(header.columns):
+        raise SplatFileError(
+            f"{path}: {header.streams} columns, expected {len(header.columns)} for degree {header.degree}"
+        )
+    first = header.table_offset + header.streams * _TABLE_ENTRY.size
+    if header.table_offset < _LONG_HEADER.size or first > len(data):
+        raise SplatFileError(
+            f"{path}: its table is said to be at byte {header.table_offset}, outside the file"
+        )
+    table = list(_TABLE_ENTRY.iter_unpack(data[header.table_offset : first]))
+    for (name, size), (_, unpacked) in zip(header.columns.items(), table, strict=True):
+        if unpacked != header.count * size:
+            raise SplatFileError(
+                f"{path}: {name}: {unpacked} bytes, expected {header.count * size} for {header.count} splats"
+            )
+    if first + sum(packed for packed, _ in table) != len(data):
+        raise SplatFileError(f"{path}: its columns do not end where the file does; copy it again")
+    return table
+
+
+def _long_columns(path: Path, header: SpzHeader, data: bytes) -> list[bytes]:
+    unpack = _zstandard()[1]
+    table = _table(path, header, data)
+    ends = len(data) - np.cumsum([packed for packed, _ in table[::-1]])[::-1]
+    columns = []
+    for name, start, (packed, unpacked) in zip(header.columns, ends, table, strict=True):
+        try:
+            column = unpack(data[start : start + packed], unpacked)
+        except ValueError as error:
+            raise SplatFileError(f"{path}: {name}: damaged ({error}); copy it again") from error
+        if len(column) != unpacked:
+            raise SplatFileError(f"{path}: {name}: {len(column)} bytes, expected {unpacked}; copy it again")
+        columns.append(column)
+    return columns
+
+
+def _positions(columns: np.ndarray, bits: int) -> np.ndarray:
+    """[M, 9] bytes -> [M, 3]."""
+    words = np.zeros((len(columns), 3, 4), np.uint8)
+    words[:, :, 1:] = columns.reshape(-1, 3, 3)  # the sign at the top, eight zeros at the bottom
+    return ((words.view("<i4")[:, :, 0] >> 8) / 2.0**bits).astype(np.float32)
+
+
+def _rotations(columns: np.ndarray) -> np.ndarray:
+    """[M, 4] bytes -> [M, 4] w-x-y-z."""
+    words = np.ascontiguousarray(columns).view("<u4")[:, 0]
+    largest = words >> np.uint32(30)
+    xyzw = np.zeros((len(words), 4))
+    for i in range(3, -1, -1):
+        here = largest != i
+        steps = (words & np.uint32(511)) / _SMALLEST_THREE_STEPS * _SQRT_HALF
+        xyzw[:, i] = np.where(here, np.where(words & np.uint32(512), -steps, steps), 0)
+        words = np.where(here, words >> np.uint32(10), words)
+    missing = np.sqrt(np.maximum(1 - (xyzw**2).sum(1), 0))
+    np.put_along_axis(xyzw, largest[:, None].astype(np.int64), missing[:, None], 1)
+    return np.roll(xyzw, 1, axis=1).astype(np.float32)
+
+
+def _short_rotations(columns: np.ndarray) -> np.ndarray:
+    """[M, 3] bytes of version 2 -> [M, 4] w-x-y-z."""
+    xyz = columns / 127.5 - 1
+    w = np.sqrt(np.maximum(1 - (xyz**2).sum(1), 0))
+    return np.column_stack([w, xyz]).astype(np.float32)
+
+
+def _zstandard() -> tuple[Callable[[bytes], bytes], Callable[[bytes, int], bytes]]:
+    """compress(data), and unpack(data, most bytes), which raises ValueError. Raises MissingDependency."""
+    try:
+        import zstandard
+    except ImportError:
+        raise MissingDependency(
+            f".spz of version 4 is compressed by Zstandard: {install_line('spz')}; version 3 needs nothing more"
+        ) from None
+
+    def unpack(data: bytes, most: int) -> bytes:
+        reader: Any = zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data)
+        try:
+            return bytes(reader.read(most + 1))
+        except zstandard.ZstdError as error:
+            raise ValueError(str(error)) from error
+
+    return zstandard.ZstdCompressor(level=19).compress, unpack

@@ -1,0 +1,241 @@
+"""KHR_gaussian_splatting in binary glTF: taken apart by hand, and read from what other writers may do."""
+
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from compgs.errors import SplatFileError
+from compgs.formats import glb
+from compgs.formats.arrays import SplatArrays, normalized
+from compgs.formats.frames import LEFT_UP_FORWARD, transformed, turned
+from compgs.numerics.rotations import rotation_from_quaternion
+
+PREFIX = "KHR_gaussian_splatting:"
+
+
+def taken_apart(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """JSON and binary chunk, by the description of glTF alone."""
+    magic, version, length, text_length, text_type = struct.unpack_from("<4sIIII", data)
+    assert (magic, version, length, text_type) == (b"glTF", 2, len(data), 0x4E4F534A)
+    binary_length, binary_type = struct.unpack_from("<II", data, 20 + text_length)
+    assert binary_type == 0x004E4942 and text_length % 4 == binary_length % 4 == 0
+    assert 28 + text_length + binary_length == len(data)
+    return json.loads(data[20 : 20 + text_length]), data[28 + text_length :]
+
+
+def put_together(gltf: Any, binary: bytes) -> bytes:
+    text = json.dumps(gltf).encode()
+    text += b" " * (-len(text) % 4)
+    body = (
+        struct.pack("<II", len(text), 0x4E4F534A)
+        + text
+        + struct.pack("<II", len(binary), 0x004E4942)
+        + binary
+    )
+    return b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body
+
+
+def attribute(gltf: dict[str, Any], binary: bytes, name: str) -> np.ndarray:
+    accessor = gltf["accessors"][gltf["meshes"][0]["primitives"][0]["attributes"][name]]
+    view = gltf["bufferViews"][accessor["bufferView"]]
+    parts = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+    dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+    return np.frombuffer(binary, dtype, accessor["count"] * parts, view["byteOffset"]).reshape(-1, parts)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_the_attributes_are_those_of_the_extension(made, degree: int) -> None:
+    arrays = made(6, degree)
+    gltf, binary = taken_apart(glb.encoded(arrays))
+    assert gltf["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    primitive = gltf["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0
+    extension = primitive["extensions"]["KHR_gaussian_splatting"]
+    assert extension["kernel"] == "ellipse" and extension["colorSpace"] == "srgb_rec709_display"
+    coefficients = [(l, n) for l in range(degree + 1) for n in range(2 * l + 1)]
+    expected = {f"{PREFIX}SH_DEGREE_{l}_COEF_{n}" for l, n in coefficients}
+    expected |= {f"{PREFIX}{name}" for name in ("ROTATION", "SCALE", "OPACITY")} | {"POSITION", "COLOR_0"}
+    assert primitive["attributes"].keys() == expected
+
+    # Right, down, forward becomes left, up, forward.
+    positions = attribute(gltf, binary, "POSITION")
+    np.testing.assert_array_equal(positions, arrays.means * [-1, -1, 1])
+    place = gltf["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_allclose([place["min"], place["max"]], [positions.min(0), positions.max(0)], rtol=1e-6)
+    w, x, y, z = normalized(arrays.quaternions).T
+    np.testing.assert_allclose(
+        attribute(gltf, binary, f"{PREFIX}ROTATION"), np.column_stack([-x, -y, z, w]), atol=1e-7
+    )
+    np.testing.assert_allclose(
+        attribute(gltf, binary, f"{PREFIX}SCALE"), np.exp(arrays.log_scales), rtol=1e-6
+    )
+    np.testing.assert_allclose(attribute(gltf, binary, f"{PREFIX}OPACITY")[:, 0], arrays.opacities, rtol=1e-6)
+    np.testing.assert_array_equal(attribute(gltf, binary, f"{PREFIX}SH_DEGREE_0_COEF_0"), arrays.dc)
+    if degree:  # degree 1 is -y, z, -x
+        for n, sign in enumerate((-1, 1, -1)):
+            values = attribute(gltf, binary, f"{PREFIX}SH_DEGREE_1_COEF_{n}")
+            np.testing.assert_array_equal(values, sign * arrays.rest[:, n])
+    colors = attribute(gltf, binary, "COLOR_0") / 255
+    np.testing.assert_allclose(colors[:, :3], np.clip(0.5 + 0.28209479 * arrays.dc, 0, 1), atol=0.5001 / 255)
+    np.testing.assert_allclose(colors[:, 3], arrays.opacities, atol=0.5001 / 255)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_a_round_trip_is_off_by_rounding_alone(made, tmp_path: Path, degree: int) -> None:
+    arrays = replace(made(50, degree), world_offset=(4.2e6, -51.5, 3.0))
+    path = tmp_path / "a.glb"
+    path.write_bytes(glb.encoded(arrays))
+    again = glb.read(path)
+    for name in ("means", "dc", "rest"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(arrays, name))
+    np.testing.assert_allclose(again.log_scales, arrays.log_scales, atol=1e-6)
+    np.testing.assert_allclose(again.opacities, arrays.opacities, atol=1e-6)
+    np.testing.assert_allclose(again.quaternions, normalized(arrays.quaternions), atol=1e-6)
+    assert again.world_offset == arrays.world_offset
+    sizes = glb.component_bytes(path)
+    assert sum(sizes.values()) == path.stat().st_size and sizes["positions"] == 600
+
+
+def edited(change: Callable[[dict[str, Any]], Any]) -> Callable[[bytes], bytes]:
+    def edit(data: bytes) -> bytes:
+        gltf, binary = taken_apart(data)
+        changed = change(gltf)
+        return put_together(changed if isinstance(changed, list) else gltf, binary)
+
+    return edit
+
+
+def test_nodes_that_turn_move_and_scale_are_obeyed(made, tmp_path: Path) -> None:
+    arrays = made(5)
+    quaternion = np.array([0.5, -0.1, 0.7, 0.3])
+    quaternion /= np.linalg.norm(quaternion)
+
+    def nest(gltf: dict[str, Any]) -> None:
+        w, x, y, z = quaternion.tolist()
+        up = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 7, 8, 9, 1]  # column by column
+        gltf["nodes"] = [
+            {"mesh": 0, "scale": [2, 2, 2], "rotation": [x, y, z, w], "translation": [1, 2, 3]},
+            {"matrix": up, "children": [0]},
+        ]
+        gltf["scenes"] = [{"nodes": [1]}]
+
+    path = tmp_path / "a.glb"
+    path.write_bytes(edited(nest)(glb.encoded(arrays)))
+    found = glb.read(path)
+    inner, outer = np.eye(4), np.eye(4)
+    inner[:3, :3] = 2 * rotation_from_quaternion(quaternion)
+    inner[:3, 3] = [1, 2, 3]
+    outer[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    outer[:3, 3] = [7, 8, 9]
+    expected = turned(transformed(turned(arrays, LEFT_UP_FORWARD), outer @ inner), LEFT_UP_FORWARD)
+    for name in ("means", "log_scales", "dc", "rest"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-5)
+    np.testing.assert_allclose(found.quaternions, normalized(expected.quaternions), atol=1e-5)
+    np.testing.assert_allclose(found.world_offset, expected.world_offset)
+
+
+def test_columns_of_smaller_integers_and_rows_with_room_are_read(made, tmp_path: Path) -> None:
+    arrays = made(4, 0)
+    gltf, binary = taken_apart(glb.encoded(arrays))
+    attributes = gltf["meshes"][0]["primitives"][0]["attributes"]
+    opacities = np.array([0, 51, 102, 255], np.uint8)
+    rotations = np.array([[127, 0, 0, 0], [0, 127, 0, 0], [0, 0, -127, 0], [90, 0, 0, 90]], np.int8)
+    rows = np.zeros((4, 12), np.uint8)
+    rows[:, 4:8], rows[:, 8] = rotations.view(np.uint8), opacities
+    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": 48, "byteStride": 12}
+    gltf["bufferViews"].append(view)
+    gltf["buffers"][0]["byteLength"] += 48
+    number = len(gltf["bufferViews"]) - 1
+    common = {"bufferView": number, "count": 4, "normalized": True}
+    gltf["accessors"][attributes[f"{PREFIX}ROTATION"]] = {
+        **common,
+        "componentType": 5120,
+        "type": "VEC4",
+        "byteOffset": 4,
+    }
+    gltf["accessors"][attributes[f"{PREFIX}OPACITY"]] = {
+        **common,
+        "componentType": 5121,
+        "type": "SCALAR",
+        "byteOffset": 8,
+    }
+    path = tmp_path / "a.glb"
+    path.write_bytes(put_together(gltf, binary + rows.tobytes()))
+    found = glb.read(path)
+    np.testing.assert_allclose(found.opacities, opacities / 255, atol=2e-6)
+    # x-y-z-w in the file, half a turn about z: x and y change their signs.
+    expected = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, -1], [90 / 127, -90 / 127, 0, 0]])
+    np.testing.assert_allclose(found.quaternions, expected, atol=1e-6)
+
+
+def primitive(gltf: dict[str, Any]) -> dict[str, Any]:
+    return gltf["meshes"][0]["primitives"][0]
+
+
+def accessor(gltf: dict[str, Any], name: str) -> dict[str, Any]:
+    return gltf["accessors"][primitive(gltf)["attributes"][name]]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda data: data[:19], "ends within its header"),
+        (lambda data: data[:-4], "copy it again"),
+        (lambda data: data[:4] + b"\x01" + data[5:], "version 1"),
+        (lambda data: data[:20] + b"]" + data[21:], "not JSON"),
+        (edited(lambda g: []), "does not describe splats"),
+        (edited(lambda g: g.update(meshes=[])), "holds 0 sets"),
+        (edited(lambda g: g["meshes"].append(g["meshes"][0])), "holds 2 sets"),
+        (edited(lambda g: g.update(meshes="none")), "does not describe splats"),
+        (edited(lambda g: g.update(extensionsRequired=["EXT_small"])), "needs the extension EXT_small"),
+        (
+            edited(lambda g: primitive(g)["extensions"]["KHR_gaussian_splatting"].update(colorSpace="other")),
+            "colors in other",
+        ),
+        (edited(lambda g: primitive(g)["attributes"].pop(f"{PREFIX}SCALE")), "SCALE is missing"),
+        (
+            edited(lambda g: primitive(g)["attributes"].pop(f"{PREFIX}SH_DEGREE_2_COEF_1")),
+            "COEF_1 is missing",
+        ),
+        (edited(lambda g: primitive(g)["attributes"].update(POSITION="x")), "expected numbers of accessors"),
+        (edited(lambda g: primitive(g)["attributes"].update(POSITION=999)), "does not describe splats"),
+        (edited(lambda g: accessor(g, "POSITION").update(count=41)), "beyond its part|one number of splats"),
+        (edited(lambda g: accessor(g, "POSITION").update(count=1 << 40)), "beyond its part"),
+        (edited(lambda g: accessor(g, "POSITION").update(count=-1)), "expected whole numbers"),
+        (edited(lambda g: accessor(g, "POSITION").update(byteOffset=4)), "beyond its part"),
+        (edited(lambda g: accessor(g, "POSITION").update(type="VEC4")), "beyond its part|has 4 parts"),
+        (edited(lambda g: accessor(g, "POSITION").update(sparse={})), "sparse"),
+        (edited(lambda g: g["bufferViews"][0].update(byteLength=1 << 40)), "beyond its part"),
+        (edited(lambda g: g["buffers"][0].update(uri="other.bin")), "in another file"),
+        (edited(lambda g: g.update(nodes=[{"children": [0]}])), "not a tree"),
+        (edited(lambda g: g.update(nodes=[{}])), "in no scene"),
+        (edited(lambda g: g["nodes"][0].update(scale=[1, 2, 1])), "stretches or mirrors"),
+        (edited(lambda g: g["nodes"][0].update(scale=[-1, 1, 1])), "stretches or mirrors"),
+        (edited(lambda g: g["nodes"][0].update(scale=[0, 0, 0])), "stretches or mirrors"),
+        (edited(lambda g: g["nodes"][0].update(rotation=[0, 0, 0, 0])), "does not describe splats"),
+        (edited(lambda g: g["nodes"][0].update(translation=[1, 2])), "does not describe splats"),
+    ],
+)
+def test_a_damaged_file_is_refused_with_what_is_wrong(
+    made, tmp_path: Path, damage: Callable[[bytes], bytes], message: str
+) -> None:
+    path = tmp_path / "a.glb"
+    path.write_bytes(damage(glb.encoded(made(40))))
+    with pytest.raises(SplatFileError, match=message) as caught:
+        glb.read(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_numbers_that_cannot_be_are_refused(made, tmp_path: Path) -> None:
+    path = tmp_path / "a.glb"
+    arrays: SplatArrays = made(3)
+    arrays.means[1, 2] = np.inf
+    path.write_bytes(glb.encoded(arrays))
+    with pytest.raises(SplatFileError, match=r"means of splat 1|not JSON"):
+        glb.read(path)

@@ -1,0 +1,221 @@
+"""Niantic's .spz: bytes written by hand from the description, round trips within the steps, damage that is named."""
+
+import gzip
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compgs.errors import MissingDependency, SplatFileError
+from compgs.formats import spz
+from compgs.formats.arrays import SplatArrays, normalized
+
+try:
+    import zstandard
+except ImportError:
+    zstandard = None  # type: ignore[assignment]
+
+VERSIONS = [
+    2,
+    3,
+    pytest.param(4, marks=pytest.mark.skipif(zstandard is None, reason="zstandard is not installed")),
+]
+# One splat, degree 1, 12 fractional bits; axes right, up, back. Position (1, -0.5, 2), opacity 51/255 = 0.2,
+# color bytes, log scales (16/16 - 10, ...), rotation of 3: w largest, and coefficients 128 + (0 ... 8).
+COLUMNS = {
+    "positions": struct.pack("<i", 4096)[:3] + struct.pack("<i", -2048)[:3] + struct.pack("<i", 8192)[:3],
+    "opacities": bytes([51]),
+    "colors": bytes([0, 255, 102]),
+    "scales": bytes([16, 80, 160]),
+    # x = 1/4, y = -1/2, z = 0 of 1/sqrt(2) in 511 steps; w left out (index 3 of x, y, z, w).
+    "rotations": struct.pack("<I", 3 << 30 | 128 << 20 | (1 << 9 | 256) << 10 | 0),
+    "harmonics": bytes(range(128, 137)),
+}
+SHORT_ROTATION = bytes([191, 64, 128])  # version 2: x, y, z = byte / 127.5 - 1
+
+
+def by_hand(version: int) -> bytes:
+    columns = {**COLUMNS, "rotations": SHORT_ROTATION} if version == 2 else COLUMNS
+    start = b"NGSP" + struct.pack("<IIBBBB", version, 1, 1, 12, 0, 6 if version == 4 else 0)
+    if version < 4:
+        return gzip.compress(start + b"".join(columns.values()))
+    packed = [zstandard.ZstdCompressor().compress(column) for column in columns.values()]
+    table = b"".join(
+        struct.pack("<QQ", len(p), len(c)) for p, c in zip(packed, columns.values(), strict=True)
+    )
+    return start + struct.pack("<I12x", 32) + table + b"".join(packed)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_file_made_by_hand_holds_the_splat_it_describes(tmp_path: Path, version: int) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(by_hand(version))
+    splat = spz.read(path)
+    # Right, up, back becomes right, down, forward: y and z change their signs.
+    np.testing.assert_array_equal(splat.means, [[1, 0.5, -2]])
+    np.testing.assert_array_equal(splat.log_scales, [[-9, -5, 0]])
+    np.testing.assert_allclose(splat.opacities, [0.2], atol=1e-6)
+    np.testing.assert_allclose(splat.dc, np.array([[-0.5, 0.5, -0.1]]) / 0.15, atol=1e-6)
+    if version == 2:
+        x, y, z = 191 / 127.5 - 1, 64 / 127.5 - 1, 128 / 127.5 - 1
+    else:
+        x, y, z = 128 / 511 / 2**0.5, -256 / 511 / 2**0.5, 0
+    w = (1 - x * x - y * y - z * z) ** 0.5
+    np.testing.assert_allclose(splat.quaternions, [[w, x, -y, -z]], atol=1e-6)
+    # Degree 1 is -y, z, -x: the first two change their signs.
+    steps = np.arange(9).reshape(3, 3) / 128
+    np.testing.assert_array_equal(splat.rest[0], steps * np.array([[-1], [-1], [1]]))
+    assert sum(spz.component_bytes(path).values()) == path.stat().st_size
+
+
+@pytest.mark.parametrize("version", VERSIONS[1:])
+@pytest.mark.parametrize("degree", range(4))
+def test_a_round_trip_is_off_by_half_a_step_at_most(made, tmp_path: Path, version: int, degree: int) -> None:
+    arrays = made(500, degree)
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz.encoded(arrays, version))
+    again = spz.read(path)
+    assert again.degree == degree and len(again) == 500
+    step = 2.0 ** -spz.fractional_bits(arrays)
+    assert step < np.exp(np.median(arrays.log_scales)) / 8
+    np.testing.assert_allclose(again.means, arrays.means, atol=0.5001 * step)
+    np.testing.assert_allclose(again.log_scales, arrays.log_scales, atol=0.5001 / 16)
+    np.testing.assert_allclose(again.opacities, arrays.opacities, atol=0.5001 / 255)
+    inside = np.abs(arrays.dc) < 0.5 / 0.15
+    assert inside.mean() > 0.99
+    np.testing.assert_allclose(again.dc[inside], arrays.dc[inside], atol=0.5001 / 255 / 0.15)
+    one, other = normalized(arrays.quaternions), normalized(again.quaternions)
+    angles = 2 * np.arccos(np.minimum(np.abs((one * other).sum(1)), 1))
+    assert (
+        angles.max() < 0.004
+    )  # radians: half a step of 1/511 of sqrt(1/2) in three parts, twice, and the root
+    for columns, bits in ((slice(0, 3), 7), (slice(3, 15), 6)):
+        kept = np.abs(arrays.rest[:, columns]) < 0.95
+        error = np.abs(again.rest - arrays.rest)[:, columns][kept]
+        assert not error.size or error.max() < 0.5001 * 2 ** (1 - bits)
+
+
+def test_the_same_splats_give_the_same_bytes_and_zero_stays_zero(made, tmp_path: Path) -> None:
+    arrays = replace(made(9), rest=np.zeros((9, 15, 3), np.float32))
+    assert spz.encoded(arrays) == spz.encoded(arrays)
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz.encoded(arrays))
+    assert not spz.read(path).rest.any()
+
+
+@pytest.mark.parametrize("largest", range(4))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_every_part_of_a_quaternion_may_be_the_largest(made, tmp_path: Path, largest: int, sign: int) -> None:
+    quaternion = np.array([0.3, -0.2, 0.1, -0.25], np.float32)
+    quaternion[largest] = sign * 0.9
+    arrays = replace(made(1), quaternions=quaternion[None])
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz.encoded(arrays))
+    one, other = normalized(arrays.quaternions)[0], normalized(spz.read(path).quaternions)[0]
+    assert abs(one @ other) > 1 - 5e-6
+
+
+def test_positions_beyond_24_bits_are_refused_and_far_ones_get_fewer_digits(made) -> None:
+    arrays = made(5)
+    near = spz.fractional_bits(arrays)
+    assert spz.fractional_bits(replace(arrays, means=arrays.means * 1e5)) < near
+    with pytest.raises(SplatFileError, match=r"positions reach .* write \.ply or \.glb"):
+        spz.encoded(replace(arrays, means=arrays.means * 1e8))
+
+
+def test_version_4_without_zstandard_names_the_remedy(made, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "zstandard", None)
+    with pytest.raises(MissingDependency, match=r"pip install '\.\[spz\]'.*version 3 needs nothing"):
+        spz.encoded(made(2), 4)
+    assert spz.encoded(made(2), 3)
+
+
+def unpacked(change: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    return lambda data: gzip.compress(change(gzip.decompress(data)))
+
+
+def at(position: int, value: bytes) -> Callable[[bytes], bytes]:
+    return lambda data: data[:position] + value + data[position + len(value) :]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda data: data[:4], "ends within its header"),
+        (lambda data: data[:-12], "damaged|unpacked, the file holds"),
+        (lambda data: data + b"more", "copy it again"),
+        (lambda data: data[:20] + bytes([data[20] ^ 255]) + data[21:], "a.spz"),
+        (unpacked(at(4, b"\x01")), "version 1 inside gzip"),
+        (unpacked(at(4, b"\x04")), "version 4 inside gzip"),
+        (unpacked(at(8, struct.pack("<I", 41))), "41 splats are"),
+        (unpacked(at(8, struct.pack("<I", 39))), "39 splats are"),
+        (unpacked(at(8, struct.pack("<I", 0))), "holds no splats"),
+        (unpacked(at(8, struct.pack("<I", 1 << 31))), "promises 2147483648 splats"),
+        (unpacked(at(12, b"\x04")), "degree 4"),
+        (unpacked(at(13, b"\x19")), "25 fractional bits"),
+        (unpacked(lambda data: data + bytes(1 << 16)), "the file holds more than"),
+    ],
+)
+def test_a_damaged_file_is_refused_with_what_is_wrong(
+    made, tmp_path: Path, damage: Callable[[bytes], bytes], message: str
+) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(damage(spz.encoded(made(40))))
+    with pytest.raises(SplatFileError, match=message) as caught:
+        spz.read(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_extensions_after_the_splats_are_skipped(made, tmp_path: Path) -> None:
+    path = tmp_path / "a.spz"
+    content = gzip.decompress(spz.encoded(made(4)))
+    path.write_bytes(gzip.compress(content[:14] + b"\x02" + content[15:] + b"extension"))
+    assert len(spz.read(path)) == 4
+
+
+@pytest.mark.skipif(zstandard is None, reason="zstandard is not installed")
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (at(4, struct.pack("<I", 3)), "version 3 outside gzip"),
+        (at(8, struct.pack("<I", 41)), "positions: 360 bytes, expected 369 for 41 splats"),
+        (at(15, b"\x05"), "5 columns, expected 6"),
+        (at(16, struct.pack("<I", 31)), "byte 31, outside the file"),
+        (at(16, struct.pack("<I", 1 << 30)), "outside the file"),
+        (at(32, struct.pack("<Q", 1 << 40)), "do not end where the file does"),
+        (lambda data: data + b"x", "do not end where the file does"),
+        (lambda data: data[:-1], "do not end where the file does"),
+        (at(32 + 96, b"\x00"), "positions: damaged"),
+    ],
+)
+def test_damage_of_version_4_is_named(
+    made, tmp_path: Path, damage: Callable[[bytes], bytes], message: str
+) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(damage(spz.encoded(made(40), 4)))
+    with pytest.raises(SplatFileError, match=message):
+        spz.read(path)
+
+
+@pytest.mark.skipif(zstandard is None, reason="zstandard is not installed")
+def test_a_column_that_unpacks_to_more_than_it_says_is_not_unpacked_to_its_end(made, tmp_path: Path) -> None:
+    path = tmp_path / "a.spz"
+    data = spz.encoded(made(40), 4)
+    first = struct.unpack_from("<Q", data, 32)[0]
+    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 28))
+    table = struct.pack("<Q", len(bomb)) + data[40:128]
+    path.write_bytes(data[:32] + table + bomb + data[128 + first :])
+    with pytest.raises(SplatFileError, match="positions: 361 bytes, expected 360"):
+        spz.read(path)
+
+
+def test_arrays_are_read_as_they_are_for_a_model(made, tmp_path: Path) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz.encoded(made(3, 2)))
+    arrays: SplatArrays = spz.read(path)
+    assert {array.dtype for name, array in vars(arrays).items() if name != "world_offset"} == {
+        np.dtype(np.float32)
+    }

@@ -1,0 +1,188 @@
+"""Export from a file to a file: what is written, what is measured, what is refused."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import compgs
+from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
+from compgs.exporting import Exported, export, own_cameras, smaller
+from compgs.formats import arrays_of, encoded, open_scene, read_ply
+from compgs.model.splats import SplatModel, Splats
+
+
+def splats(count: int = 60, degree: int = 1) -> Splats:
+    chance = torch.Generator().manual_seed(0)
+    return Splats(
+        means=torch.rand(count, 3, generator=chance),
+        log_scales=torch.full((count, 3), -2.5),
+        quaternions=torch.randn(count, 4, generator=chance),
+        opacity_logits=torch.linspace(-3, 3, count),
+        dc=torch.randn(count, 3, generator=chance),
+        rest=0.2 * torch.randn(count, (degree + 1) ** 2 - 1, 3, generator=chance),
+    )
+
+
+@pytest.fixture
+def ply(tmp_path: Path) -> Path:
+    path = tmp_path / "a.ply"
+    path.write_bytes(encoded(arrays_of(splats()), "ply"))
+    return path
+
+
+def test_the_public_face_has_it() -> None:
+    assert compgs.export is export and compgs.open_scene is open_scene
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb"])
+def test_splats_that_nothing_is_asked_of_keep_their_numbers(ply: Path, tmp_path: Path, kind: str) -> None:
+    out = tmp_path / f"b.{kind}"
+    done = export(ply, out)
+    assert done.bytes == out.stat().st_size and done.splats == 60 and done.dropped == 0
+    assert done.worst > 90 and len(done.psnr) == 84
+    again = open_scene(out)
+    assert isinstance(again, SplatModel)
+    for name, tensor in vars(splats()).items():
+        found = getattr(again.splats, name)
+        if name == "quaternions":
+            tensor, found = (torch.nn.functional.normalize(t, dim=1) for t in (tensor, found))
+        torch.testing.assert_close(found, tensor, atol=1e-5, rtol=0)
+
+
+def test_the_loss_of_quantization_is_measured_on_the_written_file(ply: Path, tmp_path: Path) -> None:
+    done = export(ply, tmp_path / "b.spz")
+    assert 25 < done.worst < done.mean < 90
+
+
+def test_harmonics_above_the_degree_are_left_out_and_the_rest_is_fitted(ply: Path, tmp_path: Path) -> None:
+    plain = export(ply, tmp_path / "b.ply", degree=0, refine=0)
+    fitted = export(ply, tmp_path / "c.ply", degree=0, refine=60)
+    assert read_ply(tmp_path / "b.ply").degree == 0
+    assert plain.mean < fitted.mean < 60
+
+
+def test_a_limit_on_splats_keeps_those_that_count(ply: Path, tmp_path: Path) -> None:
+    done = export(ply, tmp_path / "b.ply", max_splats=20, refine=0)
+    kept = read_ply(tmp_path / "b.ply")
+    assert len(kept) == done.splats == 20 and done.dropped == 40
+    # All are of one size and in one place: the opaque ones count.
+    assert kept.opacity_logits.mean() > splats().opacity_logits.median()
+
+
+@pytest.mark.parametrize("kind", ["ply", "spz"])
+def test_a_limit_on_bytes_is_kept_and_used(ply: Path, tmp_path: Path, kind: str) -> None:
+    whole = export(ply, tmp_path / f"whole.{kind}").bytes
+    limit = whole * 2 // 3
+    done = export(ply, tmp_path / f"b.{kind}", max_bytes=limit, refine=3)
+    assert 0.85 * limit < done.bytes <= limit
+    assert done.splats is not None and done.splats + done.dropped == 60 > done.splats
+    with pytest.raises(ConfigError, match=r"max_bytes = 50: too few for any splat, expected .* or more"):
+        export(ply, tmp_path / f"c.{kind}", max_bytes=50)
+    assert not (tmp_path / f"c.{kind}").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"degree": 4}, "degree = 4: expected 0 to 3"),
+        ({"degree": -1}, "degree = -1"),
+        ({"refine": -1}, "refine = -1"),
+        ({"max_splats": 0}, "max_splats = 0: expected 1 to any number"),
+        ({"max_bytes": 0}, "max_bytes = 0"),
+    ],
+)
+def test_settings_out_of_range_are_named(
+    ply: Path, tmp_path: Path, options: dict[str, int], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        export(ply, tmp_path / "b.ply", **options)
+
+
+def test_what_cannot_be_written_is_refused_before_anything_is_read(tmp_path: Path) -> None:
+    nowhere = tmp_path / "nowhere.cgs"
+    with pytest.raises(OutputError, match=r"ends in \.ply, \.spz, \.sog, \.glb, \.html"):
+        export(nowhere, tmp_path / "b.splat")
+    (tmp_path / "b.ply").touch()
+    with pytest.raises(OutputError, match="overwrite=True"):
+        export(nowhere, tmp_path / "b.ply")
+    with pytest.raises(NotACompGSFile, match="no such file"):
+        export(nowhere, tmp_path / "c.ply")
+
+
+def test_places_in_the_world_are_kept_where_the_format_can(tmp_path: Path) -> None:
+    source = tmp_path / "a.glb"
+    offset = (4.2e6, 5e5, -20.0)
+    source.write_bytes(encoded(arrays_of(splats(), offset), "glb"))
+    assert export(source, tmp_path / "b.glb").origin == (0.0, 0.0, 0.0)
+    assert open_scene(tmp_path / "b.glb").world_offset == offset
+    for kind in ("spz", "sog"):
+        done = export(source, tmp_path / f"b.{kind}")
+        assert done.origin == offset and done.worst > 25
+    export(source, tmp_path / "b.ply")
+    expected = splats().means.double() + torch.tensor(offset, dtype=torch.float64)
+    assert torch.equal(read_ply(tmp_path / "b.ply").means, expected.float())
+
+
+def test_progress_ends_at_its_total(ply: Path, tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    export(ply, tmp_path / "b.ply", max_splats=30, refine=4, progress=lambda *counts: seen.append(counts))
+    total = seen[0][1]
+    assert seen == [(i + 1, total) for i in range(total)]
+
+
+def test_without_viewpoints_a_scene_is_looked_at_from_all_around() -> None:
+    model = SplatModel(splats(), (0.0, 0.0, 0.0), (1e6, 0.0, 0.0))
+    cameras = own_cameras(model)
+    middle = splats().means.median(0).values.numpy() + np.array(model.world_offset)
+    directions = np.stack([camera.center - middle for camera in cameras])
+    assert len(cameras) == 72 and np.abs(directions).max() < 10
+    assert np.abs(directions.mean(0)[[0, 2]]).max() < 0.2 * np.linalg.norm(directions, axis=1).mean()
+
+
+def test_large_views_are_baked_from_smaller_ones() -> None:
+    camera = own_cameras(SplatModel(splats(), (0.0, 0.0, 0.0)))[0]
+    large = camera.resized(1600, 1200)
+    assert (smaller(large).width, smaller(large).height) == (800, 600)
+    assert smaller(large).fx == pytest.approx(large.fx / 2)
+    assert smaller(camera).width == camera.width
+
+
+def test_equal_pictures_do_not_hide_the_others() -> None:
+    infinite = float("inf")
+    assert Exported(1, 1, 0, (infinite, 40.0), (0.0, 0.0, 0.0)).mean == 70.0
+    assert Exported(1, 1, 0, (infinite, infinite), (0.0, 0.0, 0.0)).mean == infinite
+
+
+def test_a_page_holds_the_file_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiny_cgs: Path
+) -> None:
+    viewer = SimpleNamespace(html_page=lambda data, title: f"<title>{title}</title>{len(data)}")
+    monkeypatch.setitem(sys.modules, "compgs.viewer", viewer)
+    done = export(tiny_cgs, tmp_path / "garden.html")
+    assert (tmp_path / "garden.html").read_text() == f"<title>tiny</title>{tiny_cgs.stat().st_size}"
+    assert done.splats is None and done.psnr == ()
+
+
+def test_a_build_without_the_viewer_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiny_cgs: Path, ply: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "compgs.viewer", None)
+    with pytest.raises(MissingDependency, match="no viewer for web pages"):
+        export(tiny_cgs, tmp_path / "garden.html")
+    with pytest.raises(NotACompGSFile, match=r"a page shows a \.cgs file, found a \.ply"):
+        export(ply, tmp_path / "b.html")
+    assert not list(tmp_path.glob("*.html"))
+
+
+def test_a_neural_scene_is_baked_over_its_own_viewpoints(
+    tmp_path: Path, tiny_cgs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = export(tiny_cgs, tmp_path / "a.ply", degree=1, refine=20)
+    model = compgs.decode(tiny_cgs)
+    assert done.splats is not None and 0 < done.splats <= model.coupled
+    assert len(done.psnr) == len(model.viewpoints) + 12
+    assert done.mean > 30
