@@ -9,7 +9,7 @@ import pytest
 
 import compgs
 from compgs.cameras import Camera
-from compgs.codec.content import FileContent, Role
+from compgs.codec.content import FileContent
 from compgs.codec.writer import write_content
 from compgs.viewer import html_page
 
@@ -31,8 +31,7 @@ CONTENTS = {
 
 
 def written(content: FileContent) -> bytes:
-    own = any(group.shape.role == Role.RESIDUAL for group in content.groups)
-    heads = make_heads(np.random.default_rng(5), content.dimensions, own_residuals=own)
+    heads = make_heads(np.random.default_rng(5), content.dimensions)
     return write_content(replace(content, heads=heads))
 
 

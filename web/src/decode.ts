@@ -25,11 +25,11 @@ export function decode(data: ArrayBuffer | Uint8Array, options: DecodeOptions = 
   let bytes = data instanceof Uint8Array ? data : new Uint8Array(data);
   if (typeof prefix === "number") bytes = bytes.subarray(0, Math.max(0, prefix));
   const isPrefix = prefix !== false;
-  const sections = unpack(bytes, isPrefix);
+  const { sections, hasAllLatents } = unpack(bytes, isPrefix);
   const decoder = new SceneDecoder(sections, kernels, bytes.length, !isPrefix);
   for (const section of sections) {
     if (section.number === SectionNumber.latents) decoder.addRange(section, bytes.length);
   }
-  if (!isPrefix) decoder.checkComplete();
+  if (hasAllLatents) decoder.checkComplete();
   return decoder.scene();
 }

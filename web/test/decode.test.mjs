@@ -22,14 +22,16 @@ for (const [kind, kernels] of Object.entries(KINDS)) {
 
   test(`${kind}: damaged files are refused as the Python package refuses them`, () => {
     const wrong = [];
-    refusedFiles().forEach(({ data, error }, i) => {
+    refusedFiles().forEach(({ data, prefix, error, anchors }, i) => {
       let found = null;
+      let count = 0;
       try {
-        decode(Buffer.from(data, "base64"), { kernels });
+        count = decode(Buffer.from(data, "base64"), { kernels, prefix }).anchors;
       } catch (thrown) {
         found = thrown.name;
       }
       if (found !== error) wrong.push(`case ${i}: ${found}, expected ${error}`);
+      else if (count !== anchors) wrong.push(`case ${i}: ${count} anchors, expected ${anchors}`);
     });
     assert.deepEqual(wrong, []);
   });

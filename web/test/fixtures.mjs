@@ -26,6 +26,16 @@ export function goldenFiles() {
     .filter(({ bytes }) => bytes[4] === VERSION);
 }
 
+/** [name, bytes, pinned] of what a camera sees of the golden files. */
+export function goldenGaussians() {
+  const path = join(GOLDEN, "gaussians.json");
+  if (!existsSync(path)) return [];
+  const pinned = JSON.parse(readFileSync(path, "utf8"));
+  return goldenFiles()
+    .filter(({ name }) => name in pinned)
+    .map(({ name, bytes }) => ({ name, bytes, pinned: pinned[name] }));
+}
+
 export function fixtures() {
   if (!FIXTURES) return [];
   return readdirSync(FIXTURES)

@@ -7,9 +7,9 @@ FOLDER gets, for each made-up content and each file that is named:
 - NAME.cgs, the file;
 - NAME.json: hashes of its arrays, as in tests/golden/hashes.json, of the whole and of each prefix that ends with a
   section of latents; numbers of the scene; and the Gaussians that a camera sees, as offsets into NAME.bin;
-- NAME.bin: little-endian float32 arrays.
+- NAME.bin: little-endian float32 arrays: those of FIELDS, then the sizes that scales are shares of.
 
-and refused.json: damaged files, with the name of the error of each.
+and refused.json: damaged files, with the name of the error of each, or the number of anchors.
 """
 
 import base64
@@ -101,9 +101,7 @@ def _viewpoint(i: int) -> Viewpoint:
 
 
 def _with_heads(content: FileContent) -> FileContent:
-    own = any(g.shape.role == Role.RESIDUAL for g in content.groups)
-    heads = make_heads(np.random.default_rng(5), content.dimensions, own_residuals=own)
-    # Log scales as large as trained ones: exp of them must stay a length.
+    heads = make_heads(np.random.default_rng(5), content.dimensions)
     return replace(content, heads=heads)
 
 
@@ -130,10 +128,12 @@ def expected(data: bytes) -> tuple[dict[str, Any], bytes]:
     views = content.viewpoints
     model = from_latents(content, latents, "cpu")
     camera = _camera(content)
-    found = model.gaussians(camera.moved(content.world_offset))
+    found, index = model.drawn(camera.moved(content.world_offset))
     values = {name: getattr(found, name).double().numpy() for name in FIELDS}
     drawn = _sound(values)
     arrays = [values[name][drawn].astype("<f4") for name in FIELDS]
+    p = model.primitives
+    arrays.append(p.sizes[p.anchor_index[index]].numpy()[drawn].astype("<f4"))
     return {
         "hashes": hashes(content, latents),
         "prefixes": prefixes,
@@ -181,8 +181,8 @@ def _camera(content: FileContent) -> Camera:
     return Camera(pose, 50, 50, 32, 32, 64, 64)
 
 
-def refused(files: dict[str, bytes]) -> list[dict[str, str]]:
-    """Damaged files and what the package says of each; null where it decodes them."""
+def refused(files: dict[str, bytes]) -> list[dict[str, Any]]:
+    """Damaged files and what the package says of each, whole and as beginnings; null where it decodes them."""
     rng = np.random.default_rng(0)
     cases = []
     names = sorted(files)
@@ -198,10 +198,8 @@ def refused(files: dict[str, bytes]) -> list[dict[str, str]]:
             data += b"\0"
         else:  # a damaged payload under checksums that match it
             _damage_payload(data, rng)
-        cases.append({"data": base64.b64encode(bytes(data)).decode(), "error": _error(bytes(data))})
-    for start in STARTS:
-        cases.append({"data": base64.b64encode(start).decode(), "error": _error(start)})
-    return cases
+        cases += [_case(bytes(data), prefix=False), _case(bytes(data), prefix=True)]
+    return cases + [_case(start, prefix=prefix) for start in STARTS for prefix in (False, True)]
 
 
 def _damage_payload(data: bytearray, rng: np.random.Generator) -> None:
@@ -219,12 +217,14 @@ def _damage_payload(data: bytearray, rng: np.random.Generator) -> None:
     data[7 + 9 * count : 11 + 9 * count] = zlib.crc32(data[: 7 + 9 * count]).to_bytes(4, "little")
 
 
-def _error(data: bytes) -> str | None:
+def _case(data: bytes, *, prefix: bool) -> dict[str, Any]:
+    """The bytes, whether they are decoded as the beginning of a file, and what comes of it."""
+    error, anchors = None, 0
     try:
-        read_latents(data)
-    except BitstreamError as error:
-        return type(error).__name__
-    return None
+        anchors = len(read_latents(data, prefix=prefix)[0].coordinates)
+    except BitstreamError as refused:
+        error = type(refused).__name__
+    return {"data": base64.b64encode(data).decode(), "prefix": prefix, "error": error, "anchors": anchors}
 
 
 def _written(content: FileContent, levels: list[int] | None) -> bytes:

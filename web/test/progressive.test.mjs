@@ -47,7 +47,8 @@ for (const { name, bytes, hashes } of goldenFiles()) {
 }
 
 test("damaged files are refused in pieces, too", () => {
-  for (const { data, error } of refusedFiles()) {
+  for (const { data, prefix, error } of refusedFiles()) {
+    if (prefix) continue;
     const refuse = () => {
       const decoder = new ProgressiveDecoder();
       for (const piece of pieces(Buffer.from(data, "base64"), 1000)) decoder.push(piece);

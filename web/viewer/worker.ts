@@ -51,7 +51,9 @@ function setEye(next: Eye): void {
 
 async function openUrl(ticket: number, url: string): Promise<void> {
   try {
-    const response = await fetch(url);
+    const response = await fetch(url).catch((error: Error) => {
+      throw new Error(`${url} cannot be fetched (${error.message}). Another site must allow it by CORS headers.`);
+    });
     if (!response.ok) throw new Error(`${url}: the server answers ${response.status} ${response.statusText}`);
     const length = Number(response.headers.get("Content-Length")) || null;
     await open(ticket, response.body!, response.headers.get("Content-Encoding") ? null : length);

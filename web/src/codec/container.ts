@@ -54,18 +54,21 @@ export interface SectionEntry {
 }
 
 /**
- * The sections of a file, their checksums verified.
+ * The sections of a file, their checksums verified, and whether all its latents are among them.
  *
- * With `prefix` the file may end early: the sections that are whole, of which all but latents must be.
+ * With `prefix` the file may end early: the sections before the first that is not there to its end. The first section
+ * of latents and all before it must be there.
  */
-export function unpack(file: Uint8Array, prefix: boolean): Section[] {
+export function unpack(file: Uint8Array, prefix: boolean): { sections: Section[]; hasAllLatents: boolean } {
   const entries = readHeader(file);
+  const isLatents = ({ number }: { number: number }): boolean => number === SectionNumber.latents;
   const sections: Section[] = [];
   for (const entry of entries) {
     const end = entry.start + entry.length;
     if (end > file.length) {
-      const isComplete = sections.some((s) => s.number === SectionNumber.latents);
-      if (prefix && isComplete) return sections;
+      if (prefix && sections.some(isLatents)) {
+        return { sections, hasAllLatents: sections.filter(isLatents).length === entries.filter(isLatents).length };
+      }
       throw new TruncatedSection(
         `${entry.name}: header promises ${entry.length} bytes, file ends after ${Math.max(0, file.length - entry.start)}`,
       );
@@ -75,7 +78,7 @@ export function unpack(file: Uint8Array, prefix: boolean): Section[] {
   const last = entries[entries.length - 1]!;
   const extra = file.length - (last.start + last.length);
   if (extra > 0) throw new CorruptSection(`file: ${extra} bytes after the last section`);
-  return sections;
+  return { sections, hasAllLatents: true };
 }
 
 /** A section whose bytes are all there. */

@@ -87,10 +87,7 @@ export class SceneDecoder {
     bytes: number,
     whole: boolean,
   ) {
-    const find = (number: number): Section => sections.find((s) => s.number === number)!;
-    if (sections.some((s) => s.number === SectionNumber.gpccPositions)) {
-      throw new MissingDependency("positions (G-PCC): this decoder has no G-PCC; write the file with octree positions");
-    }
+    const find = (number: number): Section | undefined => sections.find((s) => s.number === number);
     const [scene, positions, masks] = [SectionNumber.scene, SectionNumber.positions, SectionNumber.masks].map(find);
     const [tables, networks, heads] = [SectionNumber.tables, SectionNumber.networks, SectionNumber.heads].map(find);
     this.section = readScene(scene!.payload, scene!.name);
@@ -104,7 +101,10 @@ export class SceneDecoder {
     this.tensors = readHeads(heads!.payload, heads!.name, kernels);
     this.headElements = [...this.tensors.values()].reduce((sum, tensor) => sum + tensor.values.length, 0);
     if (whole) checkHeadProducts(coupled, this.headElements, bytes);
-    const found = readPositions(positions!.payload, anchors, positions!.name, kernels);
+    if (!positions) {
+      throw new MissingDependency("positions (G-PCC): this decoder has no G-PCC; write the file with octree positions");
+    }
+    const found = readPositions(positions.payload, anchors, positions.name, kernels);
     this.depth = found.depth;
     const order = canonicalOrder(found.offsets, found.depth);
     this.offsets = order.offsets;

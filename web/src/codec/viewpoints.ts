@@ -2,7 +2,10 @@
 
 import { FieldReader } from "./fields.ts";
 
-const COMPONENT_UNIT = 16383 * Math.SQRT2;
+const MAX_COMPONENT = 16383;
+const COMPONENT_UNIT = MAX_COMPONENT * Math.SQRT2;
+/** Of three stored components: 3/4 and what their rounding adds. Beyond it the fourth would not be the largest. */
+const MAX_SQUARES = 3 * 2 ** 27;
 const POSITION_UNIT = 32767;
 
 export interface Viewpoint {
@@ -66,12 +69,16 @@ function readRotation(reader: FieldReader): [number, number, number, number] {
   const packed = low + 65536 * reader.u32("rotation");
   if (packed >= 2 ** 47) reader.refuse("bit 47 of a rotation is not 0");
   const largest = packed % 4;
-  const others = [0, 1, 2].map((i) => {
+  const stored = [0, 1, 2].map((i) => {
     const bits = Math.floor(packed / 2 ** (2 + 15 * i)) % 32768;
-    return (bits >= 16384 ? bits - 32768 : bits) / COMPONENT_UNIT;
+    return bits >= 16384 ? bits - 32768 : bits;
   });
+  const squares = stored.reduce((sum, x) => sum + x * x, 0);
+  if (squares > MAX_SQUARES || stored.some((x) => x < -MAX_COMPONENT)) {
+    reader.refuse(`a rotation's components are ${stored}, beyond those of a unit quaternion`);
+  }
+  const others = stored.map((x) => x / COMPONENT_UNIT);
   const rest = 1 - others.reduce((sum, x) => sum + x * x, 0);
-  if (rest < 0) reader.refuse("a rotation's components are too large");
   others.splice(largest, 0, Math.sqrt(rest));
   return others as [number, number, number, number];
 }
