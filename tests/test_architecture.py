@@ -29,6 +29,7 @@ ALLOWED = {
         "render",
         "evaluation",
         "exporting",
+        "formats",
     },
     "errors": set(),
     "interrupt": set(),
