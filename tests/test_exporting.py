@@ -85,11 +85,20 @@ def test_a_limit_on_bytes_is_kept_and_used(ply: Path, tmp_path: Path, kind: str)
     assert not (tmp_path / f"c.{kind}").exists()
 
 
+def test_spz_files_are_of_the_version_that_is_asked_for(ply: Path, tmp_path: Path) -> None:
+    pytest.importorskip("zstandard")
+    export(ply, tmp_path / "b.spz")
+    export(ply, tmp_path / "c.spz", spz_version=4)
+    assert (tmp_path / "b.spz").read_bytes()[:2] == b"\x1f\x8b"
+    assert (tmp_path / "c.spz").read_bytes()[:8] == b"NGSP\x04\0\0\0"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"degree": 4}, "degree = 4: expected 0 to 3"),
         ({"degree": -1}, "degree = -1"),
+        ({"spz_version": 2}, "spz_version = 2"),
         ({"refine": -1}, "refine = -1"),
         ({"max_splats": 0}, "max_splats = 0: expected 1 to any number"),
         ({"max_bytes": 0}, "max_bytes = 0"),

@@ -6,6 +6,7 @@
 What is measured is what the new file holds, so that the loss of quantization is in it.
 """
 
+import functools
 import importlib
 import itertools
 import tempfile
@@ -21,7 +22,7 @@ from compgs.cameras import Camera
 from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import between, surround
 from compgs.evaluation.importance import splat_importance
-from compgs.formats import WRITERS, SplatArrays, arrays_of, encoded, format_of, open_scene
+from compgs.formats import WRITERS, SplatArrays, arrays_of, format_of, open_scene, spz
 from compgs.formats.baking import Baked, bake
 from compgs.formats.refining import refine as refine_splats
 from compgs.formats.registry import KEEP_WORLD_OFFSET
@@ -70,6 +71,7 @@ def export(
     refine: int = 100,
     max_splats: int | None = None,
     max_bytes: int | None = None,
+    spz_version: int = 3,
     overwrite: bool = False,
     device: str | torch.device | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -80,13 +82,16 @@ def export(
     between them. Of files of splats, harmonics above `degree` are left out. With `max_splats` or `max_bytes` those
     splats stay that contribute most to the pictures. What was changed is then fitted, in `refine` steps, to the scene's
     own renderings.
-    Files of splats that nothing is asked of keep every number. `progress(done, total)` counts cameras and steps.
+    Files of splats that nothing is asked of keep every number. `.spz` files are of version 3, or of 4,
+    which fewer programs read and which needs the package zstandard. `progress(done, total)` counts cameras and steps.
 
     Raises ConfigError, BitstreamError, SplatFileError, OutputError, MissingDependency.
     """
     source, path = Path(source), Path(path)
     limits = Limits(degree, max_splats, max_bytes)
     limits.check(refine)
+    if spz_version not in spz.WRITTEN_VERSIONS:
+        raise ConfigError(f"spz_version = {spz_version}: expected one of {spz.WRITTEN_VERSIONS}")
     kind = path.suffix.lower().removeprefix(".")
     if kind not in (*WRITERS, HTML):
         kinds = ", ".join(f".{name}" for name in (*WRITERS, HTML))
@@ -94,6 +99,7 @@ def export(
     check_output_file(path, overwrite=overwrite)
     if kind == HTML:
         return _export_page(source, path)
+    write = functools.partial(spz.encoded, version=spz_version) if kind == "spz" else WRITERS[kind]
     model = open_scene(source, device or ("cuda" if torch.cuda.is_available() else "cpu"))
     cameras = own_cameras(model)
     fitted = [smaller(c) for c in (*cameras, *between(cameras, max(0, FITTED_CAMERAS - len(cameras))))]
@@ -105,12 +111,12 @@ def export(
     origin = (0.0, 0.0, 0.0) if kind in KEEP_WORLD_OFFSET else model.world_offset
     baked = _splats_of(model, fitted if changed else [], degree, count)
     before = len(baked.importance)
-    baked = limits.keep(baked, lambda b: encoded(_arrays(b, model, kind), kind))
+    baked = limits.keep(baked, lambda b: write(_arrays(b, model, kind)))
     if changed:
         baked = refine_splats(baked, model, fitted, refine, count)
         # Fitted numbers may compress a little worse.
-        baked = limits.keep(baked, lambda b: encoded(_arrays(b, model, kind), kind))
-    data = encoded(_arrays(baked, model, kind), kind)
+        baked = limits.keep(baked, lambda b: write(_arrays(b, model, kind)))
+    data = write(_arrays(baked, model, kind))
     psnr = tuple(_compared(model, _read_back(data, kind, model), compared, count))
     write_bytes(path, data)
     kept = len(baked.importance)

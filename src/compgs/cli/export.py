@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
@@ -48,6 +48,10 @@ class Export(ComputingCommand, SceneFileArgument):
     max_bytes: Annotated[str | None, arg(metavar="SIZE", help_behavior_hint=NO_DEFAULT)] = None
     """Keep as many as fit into a file of this size, such as 2MB or 500kB."""
 
+    spz_version: Literal[3, 4] = 3
+    """Of .spz files: 4 is a little smaller, and read by newer programs only (needs `pip install '.[spz]'` in the
+    project's folder)."""
+
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace OUT if it is there already."""
 
@@ -69,6 +73,7 @@ class Export(ComputingCommand, SceneFileArgument):
                 refine=self.refine,
                 max_splats=self.max_splats,
                 max_bytes=most,
+                spz_version=self.spz_version,
                 overwrite=self.overwrite,
                 device=self.device,
                 progress=progress,
