@@ -36,8 +36,9 @@ class Export(ComputingCommand, SceneFileArgument):
     output: Annotated[Positional[Path], arg(metavar="OUT")]
     """The file to write; what it becomes is said by what its name ends in."""
 
-    degree: Annotated[int, arg(metavar="N")] = 3
-    """Of the harmonics, 0 to 3: 0 is the same color from everywhere, and a quarter of a .ply's bytes."""
+    degree: Annotated[int | None, arg(metavar="N", help_behavior_hint=NO_DEFAULT)] = None
+    """Of the harmonics, 0 (the same color from everywhere) to 3. By default 3; with --max-bytes the highest with which
+    all splats fit, 1 at least."""
 
     refine: Annotated[int, arg(metavar="STEPS")] = 100
     """Steps in which baked splats are fitted to the scene's own pictures; 0 is faster."""
@@ -56,7 +57,8 @@ class Export(ComputingCommand, SceneFileArgument):
     """Replace OUT if it is there already."""
 
     def run(self) -> None:
-        check_range("--degree", self.degree, 0, 3)
+        if self.degree is not None:
+            check_range("--degree", self.degree, 0, 3)
         check_range("--refine", self.refine, 0, 100_000)
         most = None if self.max_bytes is None else parse_size(self.max_bytes, "--max-bytes")
         from compgs.formats import check_scene
@@ -78,15 +80,16 @@ class Export(ComputingCommand, SceneFileArgument):
                 device=self.device,
                 progress=progress,
             )
-        for line in report(self.file, self.output, exported, self.degree):
+        for line in report(self.file, self.output, exported):
             say(line)
 
 
-def report(source: Path, path: Path, exported: "Exported", degree: int) -> list[str]:
+def report(source: Path, path: Path, exported: "Exported") -> list[str]:
     """What was written, and what it costs, in words."""
     if exported.splats is None:
         return [f"{path}: {size(exported.bytes)}, a page that shows {source.name} without anything else"]
-    lines = [f"{path}: {size(exported.bytes)} ({exported.bytes:,} bytes), {exported.splats:,} splats"]
+    splats = f"{exported.splats:,} splats of degree {exported.degree}"
+    lines = [f"{path}: {size(exported.bytes)} ({exported.bytes:,} bytes), {splats}"]
     if exported.worst == float("inf"):
         lines.append(f"its pictures are those of {source.name}, from {len(exported.psnr)} cameras")
     else:
@@ -96,7 +99,7 @@ def report(source: Path, path: Path, exported: "Exported", degree: int) -> list[
         )
     if exported.dropped:
         total = exported.splats + exported.dropped
-        advice = "; a lower --degree leaves room for more of them" if degree else ""
+        advice = "; a lower --degree leaves room for more of them" if exported.degree else ""
         lines.append(f"{exported.dropped:,} of {total:,} splats were left out{advice}")
     if any(exported.origin):
         place = " ".join(f"{x:.12g}" for x in exported.origin)
