@@ -29,6 +29,7 @@ ALLOWED = {
         "evaluation",
         "formats",
         "exporting",
+        "formats",
     },
     "errors": set(),
     "interrupt": set(),
