@@ -29,7 +29,6 @@ ALLOWED = {
         "evaluation",
         "formats",
         "exporting",
-        "formats",
     },
     "errors": set(),
     "interrupt": set(),
