@@ -38,6 +38,8 @@ demo: venv
 	@$(BIN)/compgs encode demo/run -o demo.cgs --overwrite >/dev/null
 	@echo "== demo.cgs, decoded in a new process and rendered from the held-out views"
 	@$(BIN)/compgs evaluate demo.cgs demo/scene -o demo/evaluation --overwrite
+	@echo "== the same file in a web page, to open from disk"
+	@$(BIN)/compgs export demo.cgs demo.html --overwrite
 
 test: venv
 	@$(BIN)/python -m pytest --durations=5

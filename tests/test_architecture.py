@@ -27,6 +27,7 @@ ALLOWED = {
         "codec",
         "render",
         "evaluation",
+        "formats",
         "exporting",
     },
     "errors": set(),

@@ -11,7 +11,7 @@ CompGSError
 ├── OutputError                 the place to write to: exists, full, not writable
 ├── CheckpointError             a run that cannot be continued
 ├── TrainingError               a training that cannot go on (no visible primitives, not-a-number loss)
-├── SplatFileError              a .ply file that does not hold splats, or not whole ones
+├── SplatFileError              a .ply, .spz, .sog, .glb or .splat file that does not hold splats, or not whole ones
 └── BitstreamError              the .cgs file
     ├── NotACompGSFile
     ├── UnsupportedVersion
@@ -70,7 +70,7 @@ class TrainingError(CompGSError):
 
 
 class SplatFileError(CompGSError):
-    """The .ply file is damaged, or not of the layout of 3DGS."""
+    """A file of splats is damaged, or not of the layout that its format asks for."""
 
 
 class BitstreamError(CompGSError):

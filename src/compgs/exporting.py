@@ -6,6 +6,7 @@
 What is measured is what the new file holds, so that the loss of quantization is in it.
 """
 
+import functools
 import importlib
 import itertools
 import tempfile
@@ -21,7 +22,7 @@ from compgs.cameras import Camera
 from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import between, surround
 from compgs.evaluation.importance import splat_importance
-from compgs.formats import WRITERS, SplatArrays, arrays_of, encoded, format_of, open_scene
+from compgs.formats import WRITERS, SplatArrays, arrays_of, format_of, open_scene, spz
 from compgs.formats.baking import Baked, bake
 from compgs.formats.refining import refine as refine_splats
 from compgs.formats.registry import KEEP_WORLD_OFFSET
@@ -37,6 +38,7 @@ FITTED_CAMERAS = 96  # of baking; fewer than the coefficients leave colors betwe
 COMPARED_CAMERAS = 12  # between the file's own, beside those: baking saw none of them
 LONGEST_SIDE = 800  # pixels, of cameras that baking looks through
 BUDGET_ROUNDS = 12  # of dropping splats until a file is small enough
+LEAST_DEGREE = 1  # of harmonics, before splats are left out for a file to be small enough
 MOST_STEPS = 100_000  # of refining
 BUDGET_MARGIN = 0.995  # of the size aimed at: sizes are not quite proportional to the number of splats
 
@@ -47,6 +49,7 @@ class Exported:
 
     bytes: int
     splats: int | None  # None: the page holds the scene itself
+    degree: int | None  # of their harmonics
     dropped: int  # splats that were left out for the file to be small enough
     psnr: tuple[float, ...]  # dB, 8-bit images, of each camera; infinite where nothing changed
     origin: tuple[float, float, float]  # world units: where positions in the file count from
@@ -66,10 +69,11 @@ def export(
     source: str | Path,
     path: str | Path,
     *,
-    degree: int = 3,
+    degree: int | None = None,
     refine: int = 100,
     max_splats: int | None = None,
     max_bytes: int | None = None,
+    spz_version: int = 3,
     overwrite: bool = False,
     device: str | torch.device | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -78,15 +82,20 @@ def export(
 
     Of a .cgs file opacity and color are baked to harmonics of `degree` over the cameras that the file holds and more
     between them. Of files of splats, harmonics above `degree` are left out. With `max_splats` or `max_bytes` those
-    splats stay that contribute most to the pictures. What was changed is then fitted, in `refine` steps, to the scene's
-    own renderings.
-    Files of splats that nothing is asked of keep every number. `progress(done, total)` counts cameras and steps.
+    splats stay that contribute most to the pictures. Without a `degree` it is 3, or, where `max_bytes` are too few for
+    that, the highest with which all splats fit, 1 at least. What was changed is then fitted, in `refine` steps, to the
+    scene's own renderings. Files of splats that nothing is asked of keep every number.
+
+    `.spz` files are of version 3, or of 4, which fewer programs read and which needs the package zstandard.
+    `progress(done, total)` counts cameras and steps.
 
     Raises ConfigError, BitstreamError, SplatFileError, OutputError, MissingDependency.
     """
     source, path = Path(source), Path(path)
     limits = Limits(degree, max_splats, max_bytes)
     limits.check(refine)
+    if spz_version not in spz.WRITTEN_VERSIONS:
+        raise ConfigError(f"spz_version = {spz_version}: expected one of {spz.WRITTEN_VERSIONS}")
     kind = path.suffix.lower().removeprefix(".")
     if kind not in (*WRITERS, HTML):
         kinds = ", ".join(f".{name}" for name in (*WRITERS, HTML))
@@ -94,6 +103,7 @@ def export(
     check_output_file(path, overwrite=overwrite)
     if kind == HTML:
         return _export_page(source, path)
+    write = functools.partial(spz.encoded, version=spz_version) if kind == "spz" else WRITERS[kind]
     model = open_scene(source, device or ("cuda" if torch.cuda.is_available() else "cpu"))
     cameras = own_cameras(model)
     fitted = [smaller(c) for c in (*cameras, *between(cameras, max(0, FITTED_CAMERAS - len(cameras))))]
@@ -103,25 +113,23 @@ def export(
     count = _counter(steps, progress)
 
     origin = (0.0, 0.0, 0.0) if kind in KEEP_WORLD_OFFSET else model.world_offset
-    baked = _splats_of(model, fitted if changed else [], degree, count)
-    before = len(baked.importance)
-    baked = limits.keep(baked, lambda b: encoded(_arrays(b, model, kind), kind))
     if changed:
-        baked = refine_splats(baked, model, fitted, refine, count)
-        # Fitted numbers may compress a little worse.
-        baked = limits.keep(baked, lambda b: encoded(_arrays(b, model, kind), kind))
-    data = encoded(_arrays(baked, model, kind), kind)
+        baked, dropped = _limited(
+            model, fitted, limits, refine, lambda b: len(write(_arrays(b, model, kind))), count
+        )
+    else:
+        baked, dropped = _splats_of(model, (), MAX_DEGREE, count), 0
+    data = write(_arrays(baked, model, kind))
     psnr = tuple(_compared(model, _read_back(data, kind, model), compared, count))
     write_bytes(path, data)
-    kept = len(baked.importance)
-    return Exported(len(data), kept, before - kept, psnr, origin)
+    return Exported(len(data), len(baked.importance), baked.splats.degree, dropped, psnr, origin)
 
 
 @dataclass(frozen=True)
 class Limits:
     """What the splats may cost."""
 
-    degree: int  # of the harmonics
+    degree: int | None  # of the harmonics; None: what the bytes allow
     most_splats: int | None
     most_bytes: int | None  # of the file
 
@@ -139,23 +147,68 @@ class Limits:
     def change(self, model: Renderable) -> bool:
         """Whether a scene's splats cannot stay as they are."""
         fewer = self.most_splats is not None or self.most_bytes is not None
-        return fewer or not isinstance(model, SplatModel) or self.degree < model.splats.degree
+        if fewer or not isinstance(model, SplatModel):
+            return True
+        return self.degree is not None and self.degree < model.splats.degree
 
-    def keep(self, baked: Baked, write: Callable[[Baked], bytes]) -> Baked:
-        """The most important splats, as many as may be. Raises ConfigError if the bytes are too few for any."""
-        if self.most_splats is not None:
-            baked = baked.most_important(self.most_splats)
+    def by_number(self, baked: Baked) -> Baked:
+        """The most important splats, as many as may be."""
+        return baked if self.most_splats is None else baked.most_important(self.most_splats)
+
+    def by_bytes(self, baked: Baked, size: Callable[[Baked], int]) -> Baked:
+        """The same, as many as fit; `size` is that of a file. Raises ConfigError if the bytes are too few for any."""
         if self.most_bytes is None:
             return baked
         for _ in range(BUDGET_ROUNDS):
-            size = len(write(baked))
-            if size <= self.most_bytes:
+            found = size(baked)
+            if found <= self.most_bytes:
                 return baked
-            fewer = int(len(baked.importance) * BUDGET_MARGIN * self.most_bytes / size)
+            fewer = int(len(baked.importance) * BUDGET_MARGIN * self.most_bytes / found)
             if fewer < 1:
                 break
             baked = baked.most_important(fewer)
-        raise ConfigError(f"max_bytes = {self.most_bytes}: too few for any splat, expected {size} or more")
+        raise ConfigError(f"max_bytes = {self.most_bytes}: too few for any splat, expected {found} or more")
+
+    def affordable_degree(self, baked: Baked, size: Callable[[Baked], int]) -> int:
+        """Of the harmonics: the one asked for, else the highest with which all splats fit, LEAST_DEGREE at least.
+
+        All splats of degree 1 are 15 dB nearer to a scene than half of them of degree 3, in a file of one size.
+        """
+        highest = baked.splats.degree
+        if self.degree is not None or self.most_bytes is None:
+            return highest
+        for degree in range(highest, LEAST_DEGREE, -1):
+            if size(_cut(baked, degree)) <= self.most_bytes:
+                return degree
+        return min(highest, LEAST_DEGREE)
+
+
+def _limited(
+    model: Renderable,
+    cameras: Sequence[Camera],
+    limits: Limits,
+    refine: int,  # steps
+    size: Callable[[Baked], int],  # bytes of a file
+    count: Callable[[], None],
+) -> tuple[Baked, int]:
+    """The splats of a model within limits, and how many were left out."""
+    baked = _splats_of(model, cameras, MAX_DEGREE if limits.degree is None else limits.degree, count)
+    total = len(baked.importance)
+    baked = limits.by_number(baked)
+    degree = limits.affordable_degree(baked, size)
+    if degree < baked.splats.degree:
+        # Anew: harmonics that are fitted alone are not those that are fitted with higher ones.
+        baked = limits.by_number(_splats_of(model, cameras, degree, lambda: None))
+    baked = refine_splats(limits.by_bytes(baked, size), model, cameras, refine, count)
+    # Fitted numbers may compress a little worse.
+    baked = limits.by_bytes(baked, size)
+    return baked, total - len(baked.importance)
+
+
+def _cut(baked: Baked, degree: int) -> Baked:
+    """Without the harmonics above a degree."""
+    rest = baked.splats.rest[:, : coefficients(degree) - 1]
+    return replace(baked, splats=replace(baked.splats, rest=rest))
 
 
 def own_cameras(model: Renderable) -> list[Camera]:
@@ -181,9 +234,7 @@ def _splats_of(
     if isinstance(model, HybridModel):
         return bake(model, cameras, degree, count)
     assert isinstance(model, SplatModel), type(model)
-    importance = splat_importance(model, cameras, count)
-    rest = model.splats.rest[:, : coefficients(degree) - 1]
-    return Baked(replace(model.splats, rest=rest), importance)
+    return _cut(Baked(model.splats, splat_importance(model, cameras, count)), degree)
 
 
 def _arrays(baked: Baked, model: Renderable, kind: str) -> SplatArrays:
@@ -237,4 +288,4 @@ def _export_page(source: Path, path: Path) -> Exported:
     page = viewer.html_page(source.read_bytes(), source.stem)
     data = page.encode("utf-8") if isinstance(page, str) else page
     write_bytes(path, data)
-    return Exported(len(data), None, 0, (), (0.0, 0.0, 0.0))
+    return Exported(len(data), None, None, 0, (), (0.0, 0.0, 0.0))

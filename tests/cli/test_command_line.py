@@ -111,7 +111,7 @@ def test_options_with_numbers_are_found() -> None:
 def test_rubbish_in_place_of_a_number_is_named_with_its_option_and_what_was_expected(
     capsys: pytest.CaptureFixture[str], command: str, option: str, count: int
 ) -> None:
-    output = ["-o", "out"] if command == "render" else []
+    output = {"render": ["-o", "out"], "export": ["out.ply"]}.get(command, [])
     code, _, err = outcome(capsys, command, "something", *output, option, *["rubbish"] * count)
     assert code == 2
     assert_short(err)

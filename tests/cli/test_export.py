@@ -25,7 +25,7 @@ def test_a_scene_is_written_and_its_loss_is_said(
     code, said, err = outcome(capsys, "export", tiny_cgs, out, "--degree", 1, "--refine", 2)
     assert (code, err) == (0, "")
     splats = open_scene(out).counts["splats"]
-    assert f"({out.stat().st_size:,} bytes), {splats:,} splats" in said
+    assert f"({out.stat().st_size:,} bytes), {splats:,} splats of degree 1" in said
     assert "beside tiny.cgs: " in said and "dB from the worst of 24 cameras" in said
 
 
@@ -74,9 +74,9 @@ def test_mistakes_are_one_clear_line_and_nothing_is_written(
 
 
 def test_a_report_says_what_was_lost_and_left_out() -> None:
-    done = Exported(1_500_000, 2000, 3000, (40.0, 44.0), (1000000.25, 0.5, 0.0))
-    assert report(Path("a.cgs"), Path("b.sog"), done, 3) == [
-        "b.sog: 1.50 MB (1,500,000 bytes), 2,000 splats",
+    done = Exported(1_500_000, 2000, 2, 3000, (40.0, 44.0), (1000000.25, 0.5, 0.0))
+    assert report(Path("a.cgs"), Path("b.sog"), done) == [
+        "b.sog: 1.50 MB (1,500,000 bytes), 2,000 splats of degree 2",
         "beside a.cgs: 42.00 dB, 40.00 dB from the worst of 2 cameras",
         "3,000 of 5,000 splats were left out; a lower --degree leaves room for more of them",
         "note: positions count from 1000000.25 0.5 0: .sog has no place for that; .ply and .glb do",
@@ -84,16 +84,14 @@ def test_a_report_says_what_was_lost_and_left_out() -> None:
 
 
 def test_a_lower_degree_is_not_advised_where_there_is_none() -> None:
-    done = Exported(100, 20, 30, (40.0,), ORIGIN)
-    assert report(Path("a.cgs"), Path("b.ply"), done, 0)[-1] == "30 of 50 splats were left out"
+    done = Exported(100, 20, 0, 30, (40.0,), ORIGIN)
+    assert report(Path("a.cgs"), Path("b.ply"), done)[-1] == "30 of 50 splats were left out"
 
 
 def test_a_report_of_equal_pictures_and_of_a_page() -> None:
-    same = Exported(1000, 5, 0, (float("inf"),) * 2, ORIGIN)
-    assert (
-        report(Path("a.ply"), Path("b.ply"), same, 3)[1] == "its pictures are those of a.ply, from 2 cameras"
-    )
-    page = Exported(1000, None, 0, (), ORIGIN)
-    assert report(Path("a.cgs"), Path("b.html"), page, 3) == [
+    same = Exported(1000, 5, 3, 0, (float("inf"),) * 2, ORIGIN)
+    assert report(Path("a.ply"), Path("b.ply"), same)[1] == "its pictures are those of a.ply, from 2 cameras"
+    page = Exported(1000, None, None, 0, (), ORIGIN)
+    assert report(Path("a.cgs"), Path("b.html"), page) == [
         "b.html: 1.0 kB, a page that shows a.cgs without anything else"
     ]

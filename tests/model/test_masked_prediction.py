@@ -15,6 +15,7 @@ from compgs.model import (
     make_heads,
     predict,
 )
+from compgs.model.constants import OPACITY_CUTOFF
 from compgs.model.primitives import every_slot
 from compgs.render import rasterize
 
@@ -97,3 +98,13 @@ def test_masked_prediction_reads_no_value_back(layout):
     center = torch.zeros(3, device="meta")
     found = predict(heads, Primitives(*moved, 0.1), center, 4.0, compact=False)
     assert found.gaussians.means.shape == (N * K, 3)
+
+
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+def test_what_is_not_drawn_has_an_opacity_of_exactly_0(layout):
+    heads, p = make(layout, torch.float64)
+    everything = predict(heads, p, torch.zeros(3, dtype=torch.float64), 4.0, compact=False)
+    drawn = everything.opacities > OPACITY_CUTOFF
+    assert torch.equal(everything.drawn, drawn) and 0 < drawn.sum() < N * K
+    assert (everything.gaussians.opacities[~drawn] == 0).all()
+    assert torch.equal(everything.gaussians.opacities[drawn], everything.opacities[drawn])

@@ -93,7 +93,7 @@ def test_one_object_on_white_does_not_vanish(blob_scene, tiny_config):
     white = RasterSettings(background=(1.0, 1.0, 1.0))
     views = tuple(
         replace(
-            v, image=(rasterize(gaussians, v.camera, white).image.clamp(0, 1) * 255).to(torch.uint8).numpy()
+            v, pixels=(rasterize(gaussians, v.camera, white).image.clamp(0, 1) * 255).to(torch.uint8).numpy()
         )
         for v in blob_scene.train_views
     )

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
@@ -36,8 +36,9 @@ class Export(ComputingCommand, SceneFileArgument):
     output: Annotated[Positional[Path], arg(metavar="OUT")]
     """The file to write; what it becomes is said by what its name ends in."""
 
-    degree: Annotated[int, arg(metavar="N")] = 3
-    """Of the harmonics, 0 to 3: 0 is the same color from everywhere, and a quarter of a .ply's bytes."""
+    degree: Annotated[int | None, arg(metavar="N", help_behavior_hint=NO_DEFAULT)] = None
+    """Of the harmonics, 0 (the same color from everywhere) to 3. By default 3; with --max-bytes the highest with which
+    all splats fit, 1 at least."""
 
     refine: Annotated[int, arg(metavar="STEPS")] = 100
     """Steps in which baked splats are fitted to the scene's own pictures; 0 is faster."""
@@ -48,11 +49,16 @@ class Export(ComputingCommand, SceneFileArgument):
     max_bytes: Annotated[str | None, arg(metavar="SIZE", help_behavior_hint=NO_DEFAULT)] = None
     """Keep as many as fit into a file of this size, such as 2MB or 500kB."""
 
+    spz_version: Literal[3, 4] = 3
+    """Of .spz files: 4 is a little smaller, and read by newer programs only (needs `pip install '.[spz]'` in the
+    project's folder)."""
+
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace OUT if it is there already."""
 
     def run(self) -> None:
-        check_range("--degree", self.degree, 0, 3)
+        if self.degree is not None:
+            check_range("--degree", self.degree, 0, 3)
         check_range("--refine", self.refine, 0, 100_000)
         most = None if self.max_bytes is None else parse_size(self.max_bytes, "--max-bytes")
         from compgs.formats import check_scene
@@ -69,19 +75,21 @@ class Export(ComputingCommand, SceneFileArgument):
                 refine=self.refine,
                 max_splats=self.max_splats,
                 max_bytes=most,
+                spz_version=self.spz_version,
                 overwrite=self.overwrite,
                 device=self.device,
                 progress=progress,
             )
-        for line in report(self.file, self.output, exported, self.degree):
+        for line in report(self.file, self.output, exported):
             say(line)
 
 
-def report(source: Path, path: Path, exported: "Exported", degree: int) -> list[str]:
+def report(source: Path, path: Path, exported: "Exported") -> list[str]:
     """What was written, and what it costs, in words."""
     if exported.splats is None:
         return [f"{path}: {size(exported.bytes)}, a page that shows {source.name} without anything else"]
-    lines = [f"{path}: {size(exported.bytes)} ({exported.bytes:,} bytes), {exported.splats:,} splats"]
+    splats = f"{exported.splats:,} splats of degree {exported.degree}"
+    lines = [f"{path}: {size(exported.bytes)} ({exported.bytes:,} bytes), {splats}"]
     if exported.worst == float("inf"):
         lines.append(f"its pictures are those of {source.name}, from {len(exported.psnr)} cameras")
     else:
@@ -91,7 +99,7 @@ def report(source: Path, path: Path, exported: "Exported", degree: int) -> list[
         )
     if exported.dropped:
         total = exported.splats + exported.dropped
-        advice = "; a lower --degree leaves room for more of them" if degree else ""
+        advice = "; a lower --degree leaves room for more of them" if exported.degree else ""
         lines.append(f"{exported.dropped:,} of {total:,} splats were left out{advice}")
     if any(exported.origin):
         place = " ".join(f"{x:.12g}" for x in exported.origin)

@@ -259,12 +259,12 @@ def _place(path: Path, gltf: dict[str, Any], mesh: int) -> np.ndarray:
     scenes = gltf.get("scenes", [])
     roots = scenes[gltf.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
     waiting = [(index, np.eye(4), 0) for index in roots]
-    visited = 0
+    visited = set()
     while waiting:
         index, above, depth = waiting.pop()
-        visited += 1
-        if depth > _DEEPEST or visited > len(nodes) or index < 0:
+        if depth > _DEEPEST or index in visited or index < 0:
             raise SplatFileError(f"{path}: its nodes are not a tree")
+        visited.add(index)
         here = above @ _node_matrix(nodes[index])
         if nodes[index].get("mesh") == mesh:
             return here

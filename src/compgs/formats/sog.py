@@ -259,14 +259,15 @@ def _zip_contents(path: Path) -> dict[str, bytes]:
             members = archive.infolist()
             if len(members) > MOST_MEMBERS:
                 raise SplatFileError(f"{path}: {len(members)} files inside; expected at most {MOST_MEMBERS}")
-            contents = {}
+            contents: dict[str, bytes] = {}
+            room = size + MOST_META_BYTES  # images are compressed already; meta.json may be a little larger
             for member in members:
-                # What is compressed here is compressed already, but for meta.json.
-                most = size + MOST_META_BYTES
                 with archive.open(member) as file:
-                    contents[member.filename] = file.read(most + 1)
-                if len(contents[member.filename]) > most:
+                    content = file.read(room + 1)
+                room -= len(content)
+                if room < 0:
                     raise SplatFileError(f"{path}: {member.filename} is larger than the whole file may hold")
+                contents[member.filename] = content
             return contents
     except (zipfile.BadZipFile, zipfile.LargeZipFile, OSError, EOFError, ValueError, RuntimeError) as error:
         raise SplatFileError(f"{path}: is damaged ({error}); copy it again") from error
