@@ -63,6 +63,7 @@ export class Viewer {
   /** Shows a file: its bytes, or the address to stream it from. */
   open(source: ArrayBuffer | Uint8Array | string): void {
     this.info = null;
+    this.view = 0;
     this.controls.target = null;
     this.fixed = null;
     this.isTouched = false;
