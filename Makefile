@@ -1,6 +1,7 @@
 # make demo   a scene is made, trained, encoded, and its file decoded and judged in a new process: about three minutes
 # make test   the test suite
 # make lint   style and types
+# make web    the page that shows scenes in a browser, from web/; needs node 20 or later, and npm
 # Needs python3 (3.11 or later) and make; everything else is installed into .venv in this folder.
 
 PYTHON ?= python3
@@ -13,7 +14,7 @@ export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 # Idle OpenMP threads sleep instead of taking the cores from numba's.
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: help demo test lint venv
+.PHONY: help demo test lint web venv
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -37,6 +38,8 @@ demo: venv
 	@$(BIN)/compgs encode demo/run -o demo.cgs --overwrite >/dev/null
 	@echo "== demo.cgs, decoded in a new process and rendered from the held-out views"
 	@$(BIN)/compgs evaluate demo.cgs demo/scene -o demo/evaluation --overwrite
+	@echo "== the same file in a web page, to open from disk"
+	@$(BIN)/compgs export demo.cgs demo.html --overwrite
 
 test: venv
 	@$(BIN)/python -m pytest --durations=5
@@ -45,3 +48,7 @@ lint: venv
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@$(BIN)/mypy
+
+web:
+	cd web && npm ci --ignore-scripts && npm run --silent build && npm run --silent declarations
+	cp web/dist/page.html src/compgs/viewer/page.html

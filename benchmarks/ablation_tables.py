@@ -10,7 +10,8 @@ from compgs.errors import ConfigError
 from compgs.evaluation.bd_rate import Curve, bd_rate
 
 COUPLED_COMPONENTS = ("masks", "residual hyperprior", "residual embeddings")
-ANCHOR_COMPONENTS = ("positions", "reference hyperprior", "reference embeddings", "covariance")
+# Files of format version 1 call the log scales "covariance"; records of them are kept in docs/results.
+ANCHOR_COMPONENTS = ("positions", "reference hyperprior", "reference embeddings", "log scales", "covariance")
 
 Record = dict[str, Any]  # what `ablation.run_variant` knows of one finished variant and seed
 

@@ -1,6 +1,8 @@
 """The codec's speed and memory on a made-up scene, beside constriction on the same symbols in the same run.
 
-    python benchmarks/codec.py [--anchors 300000] [--output codec.json]
+    python benchmarks/codec.py [--anchors 300000] [--blocks 0] [--output codec.json]
+
+--blocks: residual blocks of the entropy networks; 0 is one linear layer.
 
 Each line is a process of its own, so that peak memory is its own. "compiling" starts with an empty kernel
 cache (the first call after installation), "cold" is the first call of a process that finds its kernels,
@@ -17,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,13 +46,13 @@ def peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def make(path: Path, anchors: int) -> dict[str, Any]:
+def make(path: Path, anchors: int, blocks: int) -> dict[str, Any]:
     """Write the scene that the other processes read."""
     from made_content import make_content
 
     from compgs.codec.writer import write_content
 
-    path.write_bytes(write_content(make_content(anchors, 0)))
+    path.write_bytes(write_content(make_content(anchors, 0, blocks=blocks, hidden=32)))
     return {}
 
 
@@ -87,19 +89,21 @@ def decode(path: Path) -> dict[str, Any]:
 
 def parts(path: Path) -> dict[str, Any]:
     """Sizes by section, and seconds of the parts of decoding."""
-    import numpy as np
-
     from compgs.codec.anchor_order import canonical_order
-    from compgs.codec.content import cross_entropy_bits, fixed_point, reconstruct, residual_context
-    from compgs.codec.integer_network import entropy_parameters
+    from compgs.codec.content import (
+        Role,
+        conditional_tables,
+        coordinate_context,
+        cross_entropy_bits,
+        existing_symbols,
+    )
     from compgs.codec.mask_coder import decode_masks, encode_masks
     from compgs.codec.octree import decode_positions, encode_positions
     from compgs.codec.rans import decode_symbols, encode_symbols
-    from compgs.codec.reader import file_info, read_content
-    from compgs.codec.tables import gaussian_tables
+    from compgs.codec.reader import file_info, group_names, read_latents
 
     data = path.read_bytes()
-    content = read_content(data)
+    content, latents = read_latents(data)
     info = file_info(data)
     seconds: dict[str, float] = {}
 
@@ -113,30 +117,27 @@ def parts(path: Path) -> dict[str, Any]:
     best("order of anchors", lambda: canonical_order(content.coordinates))
     masks = best("encode masks", lambda: encode_masks(content.mask))
     best("decode masks", lambda: decode_masks(masks, *content.mask.shape))
-    means, _ = entropy_parameters(content.networks["reference"], fixed_point(content.reference_hyper))
-    context = residual_context(content.residual_hyper, reconstruct(content.reference, means))
-    _, index = best("residual network", lambda: entropy_parameters(content.networks["residual"], context))
-    index, symbols = index.ravel(), content.residual.ravel()
-    stream = best("encode residual symbols", lambda: encode_symbols(symbols, index, gaussian_tables()))
-    best("decode residual symbols", lambda: decode_symbols(stream, index, gaussian_tables()))
+    residual = content.group(Role.RESIDUAL)
+    places = best("contexts of coordinates", lambda: coordinate_context(content.coordinates))
+    _, index, tables = best(
+        "residual network",
+        lambda: conditional_tables(residual, residual.prior, latents, places, content.mask),
+    )
+    index, symbols = index.ravel(), existing_symbols(residual, content.mask).ravel()
+    stream = best("encode residual symbols", lambda: encode_symbols(symbols, index, tables))
+    best("decode residual symbols", lambda: decode_symbols(stream, index, tables))
     bits = cross_entropy_bits(content)
     coded = {s.name: s.bytes for s in info.sections}
-    names = [
-        "reference hyperprior",
-        "reference embeddings",
-        "covariance",
-        "residual hyperprior",
-        "residual embeddings",
-    ]
-    ours = sum(coded[name] for name in names)
+    ours = sum(coded[name] for name in group_names(info.dimensions))
     return {
         "bytes": info.bytes,
         "sections": coded,
         "anchors": info.anchors,
         "coupled": info.coupled,
-        "symbols": int(info.anchors * (info.dimensions.symbols_per_anchor()) - np.sum(~content.mask) * 8),
+        "ranges": [[r.level, r.anchors, r.bytes] for r in info.ranges],
+        "symbols": sum(existing_symbols(group, content.mask).size for group in content.groups),
         "residual_symbols": len(symbols),
-        "overhead_percent": (8 * ours / sum(bits.values()) - 1) * 100,
+        "overhead_percent": (8 * ours / sum(bits) - 1) * 100,
         "seconds": seconds,
     }
 
@@ -147,16 +148,16 @@ def beside_constriction(path: Path) -> dict[str, Any]:
     import numba
     import numpy as np
 
-    from compgs.codec.content import fixed_point
-    from compgs.codec.integer_network import entropy_parameters
+    from compgs.codec.content import Role, conditional_tables, coordinate_context
     from compgs.codec.rans import decode_symbols, encode_symbols
-    from compgs.codec.reader import read_content
+    from compgs.codec.reader import read_latents
     from compgs.codec.tables import gaussian_tables
 
-    content = read_content(path.read_bytes())
-    _, index = entropy_parameters(content.networks["reference"], fixed_point(content.reference_hyper))
+    content, latents = read_latents(path.read_bytes())
+    group, places = content.group(Role.REFERENCE), coordinate_context(content.coordinates)
+    _, index, _ = conditional_tables(group, group.prior, latents, places, content.mask)
     index = np.ascontiguousarray(index.ravel()[:CONSTRICTION_SYMBOLS])
-    symbols = np.ascontiguousarray(content.reference.ravel()[:CONSTRICTION_SYMBOLS])
+    symbols = np.ascontiguousarray(group.symbols.ravel()[:CONSTRICTION_SYMBOLS])
     means, scales = np.zeros(len(index)), 2.0 ** (index / 12 - 5)
     model = constriction.stream.model.QuantizedGaussian(-1000, 1000)
     coder = constriction.stream.stack.AnsCoder()
@@ -195,8 +196,10 @@ def first_decode(path: Path) -> dict[str, Any]:
 JOBS = {"encode": encode, "decode": decode, "parts": parts, "constriction": beside_constriction}
 
 
-def child(job: str, path: Path, anchors: int, environment: dict[str, str] | None = None) -> dict[str, Any]:
-    command = [sys.executable, __file__, "--job", job, "--file", str(path), "--anchors", str(anchors)]
+def child(
+    job: str, path: Path, options: Sequence[str] = (), environment: dict[str, str] | None = None
+) -> dict[str, Any]:
+    command = [sys.executable, __file__, "--job", job, "--file", str(path), *options]
     result = subprocess.run(
         command, env=os.environ | (environment or {}), capture_output=True, text=True, check=False
     )
@@ -210,6 +213,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--anchors", type=int, default=300_000)
+    parser.add_argument("--blocks", type=int, default=0)
     parser.add_argument("--output", type=Path, help="also write the figures as JSON")
     parser.add_argument("--job", help=argparse.SUPPRESS)
     parser.add_argument("--file", type=Path, help=argparse.SUPPRESS)
@@ -217,16 +221,16 @@ def main() -> None:
     if options.job:
         others = {"make": make, "first encode": first_encode, "first decode": first_decode}
         job = others.get(options.job) or JOBS[options.job]
-        arguments = (options.file, options.anchors) if options.job == "make" else (options.file,)
-        print(json.dumps(job(*arguments)))
+        made = (options.anchors, options.blocks) if options.job == "make" else ()
+        print(json.dumps(job(options.file, *made)))
         return
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "made.cgs"
-        child("make", path, options.anchors)
-        results = {job: child(job, path, options.anchors) for job in JOBS}
+        child("make", path, ["--anchors", str(options.anchors), "--blocks", str(options.blocks)])
+        results = {job: child(job, path) for job in JOBS}
         for job in ("encode", "decode"):
             empty = {"NUMBA_CACHE_DIR": str(Path(folder) / job)}
-            results[f"compiling {job}"] = child(f"first {job}", path, options.anchors, empty)
+            results[f"compiling {job}"] = child(f"first {job}", path, environment=empty)
     results["machine"] = {"cores": os.cpu_count(), "python": platform.python_version()}
     report(results)
     if options.output:
@@ -260,6 +264,9 @@ def report(results: dict[str, Any]) -> None:
             f"{c['symbols'] / r['decode_s'] / 1e6:.1f} | {theirs['encode_s'] / r['encode_s']:.1f} | "
             f"{theirs['decode_s'] / r['decode_s']:.1f} |"
         )
+    print("\n| up to octree level | anchors | bytes of the file |\n|---|---|---|")
+    for level, anchors, size in p["ranges"]:
+        print(f"| {level} | {anchors} | {size} |")
     print("\n| section | bytes | bits per anchor |\n|---|---|---|")
     for name, value in p["sections"].items():
         print(f"| {name} | {value} | {8 * value / p['anchors']:.3f} |")

@@ -3,6 +3,7 @@
 from typing import Literal
 
 import numpy as np
+from made_heads import make_heads
 
 from compgs.codec.content import (
     LOG_SCALES,
@@ -18,7 +19,6 @@ from compgs.codec.content import (
 )
 from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork
 from compgs.codec.tables import hyper_tables
-from compgs.codec.weights import QuantizedTensor
 
 WEIGHT_SHIFT = 10
 RANDOM_ROWS = 16384
@@ -83,7 +83,7 @@ def make_content(
             spread = np.linspace(0.5, 6.0, shape.channels)
             drawn = np.rint(rng.standard_normal((rows, shape.channels)) * spread * symbols).astype(np.int32)
             prior = hyper_tables(
-                np.full((shape.width(d.coupled_primitives), 49), 1.0 / 49), _by_table(drawn, anchors)
+                np.full((shape.width(d.coupled_primitives), 49), 1.0 / 49), drawn.reshape(anchors, -1)
             )
             latents.append(fixed_point(drawn))
         if shape.role == Role.RESIDUAL:
@@ -101,13 +101,9 @@ def make_content(
         coordinates=coordinates,
         mask=mask,
         groups=tuple(groups),
-        heads=_heads(rng, d),
+        heads=make_heads(rng, d),
         metadata={"creator": "made up"},
     )
-
-
-def _by_table(symbols: np.ndarray, anchors: int) -> np.ndarray:
-    return symbols.reshape(anchors, -1)
 
 
 def _draw(rng: np.random.Generator, index: np.ndarray, symbols: bool) -> np.ndarray:
@@ -160,13 +156,4 @@ def _layer(weight: np.ndarray, bias: np.ndarray, *, rectify: bool, adds: bool = 
         shift=WEIGHT_SHIFT,
         rectify=rectify,
         adds=adds,
-    )
-
-
-def _heads(rng: np.random.Generator, d: Dimensions) -> tuple[tuple[str, QuantizedTensor], ...]:
-    shapes = {"weight": (d.width, d.reference_dim + d.residual_dim), "bias": (d.width,)}
-    return tuple(
-        (f"{head}.{name}", QuantizedTensor(np.rint(rng.laplace(0, 20, shape)).astype(np.int32), 6))
-        for head in ("geometry", "appearance")
-        for name, shape in shapes.items()
     )

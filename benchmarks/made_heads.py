@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from compgs.codec.content import Dimensions
+from compgs.codec.content import Dimensions, Role
 from compgs.codec.weights import QuantizedTensor
 
 WEIGHT_EXPONENT = 10  # a weight is a whole number times 2^-10
@@ -21,25 +21,23 @@ NETWORKS = {
 }
 
 
-def head_shapes(d: Dimensions, *, own_residuals: bool = True) -> dict[str, tuple[int, ...]]:
-    """Shape of every tensor, by name. Without own residuals, those that all anchors share are among them."""
+def head_shapes(d: Dimensions) -> dict[str, tuple[int, ...]]:
+    """Shape of every tensor, by name; where no group holds residuals, those that all anchors share are among them."""
     shapes: dict[str, tuple[int, ...]] = {}
     for network, (seen, outputs, blocks) in NETWORKS[d.heads].items():
         inputs = d.reference_dim + VIEW_DIM * seen + d.residual_dim
         shapes |= {
             f"{network}.{name}": shape for name, shape in _network_shapes(inputs, outputs, d.width, blocks)
         }
-    if not own_residuals:
+    if d.channels(Role.RESIDUAL) == 0:
         shapes["residuals"] = (d.coupled_primitives, d.residual_dim)
     return shapes
 
 
-def make_heads(
-    rng: np.random.Generator, d: Dimensions, *, own_residuals: bool = True
-) -> tuple[tuple[str, QuantizedTensor], ...]:
+def make_heads(rng: np.random.Generator, d: Dimensions) -> tuple[tuple[str, QuantizedTensor], ...]:
     """Weights that keep the size of what they are applied to, and small biases: many primitives are drawn, not all."""
     heads = []
-    for name, shape in head_shapes(d, own_residuals=own_residuals).items():
+    for name, shape in head_shapes(d).items():
         spread = _spread(name, shape)
         values = rng.standard_normal(shape) * spread * 2.0**WEIGHT_EXPONENT
         heads.append((name, QuantizedTensor(np.rint(values).astype(np.int32), WEIGHT_EXPONENT)))

@@ -14,23 +14,23 @@ import numpy as np
 import torch
 
 from compgs.cameras import Camera
-from compgs.codec.content import Dimensions
 from compgs.codec.decoder import from_latents
 from compgs.codec.reader import read_latents
 from compgs.codec.writer import write_content
 from compgs.gaussians import Gaussians
 from compgs.model import HybridModel
+from compgs.model.prediction import predict_by_torch, see
 
 sys.path.append(str(Path(__file__).parent.parent / "tools"))
-from made_content import make_content
+from made_content import make_content, make_dimensions, paper_groups
 from made_heads import make_heads
 from make_golden_gaussians import plain_content
 from plain_prediction import CUTOFF, Arrays, Content, primitives, rounded, stacked, tolerances
 
 DIMENSIONS = (
-    Dimensions(),
-    Dimensions(heads="separate"),
-    Dimensions(3, 256, 64, 2, 2, "paired", 512),
+    make_dimensions(),
+    make_dimensions(heads="separate"),
+    make_dimensions(3, paper_groups(256, 64, 2, 2), "paired", 512),
 )
 FIELDS = {
     "mean": "means",
@@ -52,6 +52,14 @@ def arrays(gaussians: Gaussians) -> Arrays:
     return {name: getattr(gaussians, field).double().numpy() for name, field in FIELDS.items()}
 
 
+def by_torch(model: HybridModel, camera: Camera) -> Gaussians:
+    """The readable prediction in float32; its networks run in kernels."""
+    p, center = model.primitives, torch.tensor(camera.center, dtype=torch.float32)
+    seen = see(p.references, p.positions, center, model.distance_unit)
+    with torch.no_grad():
+        return predict_by_torch(model.heads, p, seen).gaussians
+
+
 def deviations(found: Arrays, truth: Arrays) -> dict[str, float]:
     """Largest deviation of each kind of number, in units of its tolerance."""
     allowed = tolerances(truth)
@@ -70,7 +78,7 @@ def ways() -> dict[str, Callable[[HybridModel, Content, Camera, list[int]], Arra
 
     return {
         "kernels": lambda model, _, camera, rows: arrays(model.gaussians(camera)),
-        "torch": lambda model, _, camera, rows: arrays(model.drawn(camera)[0]),
+        "torch": lambda model, _, camera, rows: arrays(by_torch(model, camera)),
         "numpy, float32": plain(np.float32),
         "numpy, float16": plain(np.float16),
     }

@@ -1,5 +1,6 @@
-"""What tests of several rooms need: a small .cgs file."""
+"""What tests of several rooms need: Ctrl-C that is heard, and a small .cgs file."""
 
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,12 @@ from compgs.codec.writer import write_content
 from compgs.config import Config, ModelConfig
 from compgs.evaluation.camera_path import orbit
 from compgs.trained_model import TrainedModel
+
+
+def pytest_configure() -> None:
+    # Whoever starts the tests in the background starts them with Ctrl-C ignored, and so their child processes.
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

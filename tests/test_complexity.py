@@ -1,19 +1,19 @@
 """The table of complexity around phases that are made up, and the phases' own arithmetic."""
 
 import json
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 import complexity
 import complexity_phases
-from complexity_phases import PHASES, forget_peak, peak_mb, repeated, view_seconds
+from complexity_phases import PHASES, repeated, view_seconds
 
 from compgs.cli.main import main as compgs_main
 from compgs.cli.main import parse
@@ -134,14 +134,24 @@ def test_the_first_call_is_not_among_those_whose_median_counts(monkeypatch: pyte
 
 @pytest.mark.skipif(not complexity_phases.CLEAR.exists(), reason="the peak can be forgotten on Linux only")
 def test_the_peak_of_a_phase_is_its_own() -> None:
-    forget_peak()
-    start = peak_mb()
-    block = np.ones(100_000_000, np.uint8)
-    assert peak_mb() - start == pytest.approx(100, abs=20)
-    del block
-    assert peak_mb() - start == pytest.approx(100, abs=20)
-    forget_peak()
-    assert peak_mb() - start < 50
+    """In a process of its own, as a phase is: this one may hold memory that others have freed."""
+    program = f"""
+import sys; sys.path[:0] = {sys.path!r}
+import numpy as np
+from complexity_phases import forget_peak, peak_mb
+forget_peak()
+start = peak_mb()
+block = np.ones(100_000_000, np.uint8)
+held = peak_mb() - start
+del block
+after = peak_mb() - start
+forget_peak()
+print(held, after, peak_mb() - start)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    held, after, forgotten = map(float, done.stdout.split())
+    assert held == pytest.approx(100, abs=20) and after == pytest.approx(100, abs=20)
+    assert forgotten < 50
 
 
 @pytest.mark.slow
@@ -160,5 +170,6 @@ def test_all_phases_of_a_tiny_run(tmp_path: Path, method: str) -> None:
     assert found["train"]["seconds_per_step"] == pytest.approx(found["train"]["seconds"] / 12)
     assert found["evaluate"]["bytes"] == run.file.stat().st_size
     for name in complexity.MEASURED:
-        assert 0 < found[name]["before_mb"] <= found[name]["peak_mb"]
+        # The kernel counts pages thread by thread: within a megabyte.
+        assert 0 < found[name]["before_mb"] <= found[name]["peak_mb"] + 1
         assert found[name]["seconds"] > 0

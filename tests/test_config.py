@@ -1,8 +1,11 @@
+import dataclasses
 import math
+import typing
+from typing import Annotated, Literal
 
 import pytest
 
-from compgs.config import PRESETS, Config, config_from_dict, load_config
+from compgs.config import PRESETS, Config, Range, config_from_dict, load_config, wrong_value
 from compgs.errors import ConfigError
 
 
@@ -46,8 +49,8 @@ def test_an_unknown_preset_is_named_with_the_known_ones():
         ("control", "opacity_share", -0.1),
         ("control", "reset_all", 1.0),
         ("control", "finer_needs_coarser", "yes"),
-        ("entropy", "network_hidden", -3),
-        ("entropy", "network_hidden", 10**8),
+        ("entropy", "network_blocks", -3),
+        ("entropy", "network_width", 10**8),
         ("entropy", "reference_step", 0.0),
         ("model", "coupled_primitives", 65),
         ("model", "width", 12),
@@ -66,3 +69,47 @@ def test_unknown_names_are_refused_with_the_known_ones():
         config_from_dict({"training": {"lambda": 1}})
     with pytest.raises(ConfigError, match=r"optimizer.*training"):
         config_from_dict({"optimizer": {}})
+
+
+@pytest.mark.parametrize("section", dataclasses.fields(Config), ids=lambda section: section.name)
+def test_every_number_has_a_range_and_its_default_is_in_it(section):
+    for name, hint in typing.get_type_hints(section.type, include_extras=True).items():
+        plain = typing.get_type_hints(section.type)[name]
+        if plain is bool or typing.get_origin(plain) is typing.Literal or name == "seed":
+            continue
+        assert typing.get_origin(hint) is typing.Annotated, f"{section.name}.{name} has no range"
+        assert isinstance(typing.get_args(hint)[1], Range)
+
+
+@pytest.mark.parametrize(
+    ("limits", "inside", "outside", "words"),
+    [
+        (Range(0, 1), (0, 0.5, 1), (-0.1, 1.1, math.nan), "0 to 1"),
+        (Range(0, above=True), (1e-300, 1e300), (0, -1, math.inf, math.nan), "above 0"),
+        (Range(0, 1, below=True), (0, 0.999), (1, -1e-9), "0 or more, below 1"),
+        (Range(0, 1, above=True), (0.1, 1), (0, 1.1), "above 0, up to 1"),
+        (Range(8, 256, multiple=8), (8, 256), (4, 12, 264), "a multiple of 8 from 8 to 256"),
+    ],
+)
+def test_ranges_hold_what_they_say(limits, inside, outside, words):
+    assert all(value in limits for value in inside)
+    assert not any(value in limits for value in outside)
+    assert str(limits) == words
+
+
+def test_values_of_another_kind_are_refused_with_what_was_expected():
+    for value, hint, expected in (
+        (True, Annotated[int, Range(1, 9)], "1 to 9"),
+        (1.5, Annotated[int, Range(1, 9)], "1 to 9"),
+        ("x", Literal["a", "b"], "a or b"),
+        (1, bool, "true or false"),
+        ((0.1, 0.2), Annotated[tuple[float, float, float], Range(0, 1)], "3 numbers, each 0 to 1"),
+        (0.5, Annotated[tuple[float, ...], Range(0, 1)], "numbers, each 0 to 1"),
+    ):
+        assert wrong_value(value, hint) == expected
+    for value, hint in (
+        (None, Annotated[float | None, Range(0, 1)]),
+        (3, Annotated[float, Range(0, 9)]),
+        ((), Annotated[tuple[float, ...], Range(0, 1)]),
+    ):
+        assert wrong_value(value, hint) == ""

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from compgs import ssim as ssim_module
 from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer, scale_unit
-from compgs.ssim import l1_and_ssim, ssim, window
+from compgs.numerics import ssim as ssim_module
+from compgs.numerics.ssim import l1_and_ssim, ssim, window
 
 
 def pair(height, width, seed=0):

@@ -8,7 +8,7 @@ from torch import nn
 
 from compgs import metrics
 from compgs.errors import CompGSError
-from compgs.ssim import ssim
+from compgs.numerics.ssim import ssim
 
 RNG = np.random.default_rng(0)
 PHOTOGRAPH = RNG.integers(0, 256, (40, 50, 3), dtype=np.uint8)

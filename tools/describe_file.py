@@ -5,38 +5,39 @@ python tools/describe_file.py tests/golden/tiny.cgs
 
 import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from compgs.codec.content import FileContent, Role
 from compgs.codec.format import (
     HEADS,
-    HYPER_TABLES,
+    LATENTS,
     MASKS,
     METADATA,
     NETWORKS,
     POSITIONS,
     SCENE,
+    TABLES,
     container_bytes,
     unpack,
 )
-from compgs.codec.reader import read_content
+from compgs.codec.integer_network import IntegerNetwork
+from compgs.codec.rans import CHUNK_SYMBOLS
+from compgs.codec.reader import group_names, read_latents
+from compgs.codec.sections import HEADS as HEAD_LAYOUTS
+from compgs.codec.weights import ADDS, RECTIFY, SHIFTS
 
 SCENE_FIELDS = (
     ("anchors", "I"),
     ("coupled", "I"),
     ("coupled_primitives", "B"),
-    ("reference_dim", "H"),
     ("residual_dim", "B"),
-    ("reference_hyper_dim", "B"),
-    ("residual_hyper_dim", "B"),
     ("heads", "B"),
     ("width", "H"),
     ("voxel_size", "d"),
+    ("world_offset", "ddd"),
     ("view_distance_scale", "d"),
     ("background", "fff"),
-    ("reference_step", "f"),
-    ("residual_step", "f"),
-    ("covariance_step", "f"),
 )
 
 Row = tuple[bytes, str]
@@ -69,6 +70,10 @@ def signed(value: int) -> int:
     return -((value + 1) >> 1) if value & 1 else value >> 1
 
 
+def plural(count: int, thing: str) -> str:
+    return f"{count} {thing}{'s' * (count != 1)}"
+
+
 def header(data: bytes) -> Iterator[Row]:
     yield data[:4], "`Magic`"
     yield data[4:5], f"`Version` {data[4]}"
@@ -76,15 +81,34 @@ def header(data: bytes) -> Iterator[Row]:
     yield data[6:7], f"`Section_Count` {data[6]}"
     for i, section in enumerate(unpack(data)):
         entry = data[7 + 9 * i : 16 + 9 * i]
-        yield entry, f"section {section.number}, {section.name}: {len(section.data)} bytes, CRC32"
+        yield entry, f"section {section.number}, {section.name}: {plural(len(section.data), 'byte')}, CRC32"
     yield data[container_bytes(data[6]) - 4 : container_bytes(data[6])], "`Header_CRC`"
 
 
 def scene(c: Cursor) -> Iterator[Row]:
     for name, kind in SCENE_FIELDS:
         raw = c.take(struct.calcsize("<" + kind))
-        values = struct.unpack("<" + kind, raw)
-        yield raw, f"`{name}` " + ", ".join(f"{v:g}" for v in values)
+        shown = ", ".join(f"{v:g}" for v in struct.unpack("<" + kind, raw))
+        layout = f" ({HEAD_LAYOUTS[raw[0]]})" if name == "heads" else ""
+        yield raw, f"`{name}` {shown}{layout}"
+    raw, count = c.varint()
+    yield raw, f"`groups` {count}"
+    for i in range(count):
+        yield from group(c, i)
+
+
+def group(c: Cursor, index: int) -> Iterator[Row]:
+    role = c.take(1)
+    raw, channels = c.varint()
+    kind = Role(role[0]).name.lower().replace("_", " ")
+    yield role + raw, f"group {index}: `role` {role[0]}, {kind}; `channels` {channels}"
+    raw, context = c.varint()
+    seen = ["coordinates"] * (context & 1) + [f"group {i}" for i in range(index) if context >> (i + 1) & 1]
+    yield raw, f"group {index}: `context` {context}: {' and '.join(seen) or 'none, so tables'}"
+    raw, count = c.varint()
+    steps = c.take(4 * count)
+    shown = ", ".join(f"{v:g}" for v in struct.unpack(f"<{count}f", steps))
+    yield raw + steps, f"group {index}: `steps` {count}" + (f": {shown}" if count else "")
 
 
 def arrays(c: Cursor, count: int) -> Iterator[Row]:
@@ -94,15 +118,16 @@ def arrays(c: Cursor, count: int) -> Iterator[Row]:
     raw, size = c.varint()
     yield raw, f"`stream_bytes` {size}"
     inner = Cursor(c.take(size))
-    yield from stream(inner)
+    if size:
+        yield from stream(inner)
+    assert inner.at == size
     low = c.rest()
     if low:
         yield low, "`low_parts`"
 
 
 def stream(c: Cursor) -> Iterator[Row]:
-    if not c.data:
-        return
+    """A stream of few symbols: of one chunk, and so of one state."""
     raw, words = c.varint()
     yield raw, f"`words` {words}"
     raw, escapes = c.varint()
@@ -110,31 +135,35 @@ def stream(c: Cursor) -> Iterator[Row]:
     raw = c.take(8)
     yield raw, f"initial state {int.from_bytes(raw, 'little'):#x}"
     if words > 2:
-        yield c.take(4 * (words - 2)), f"{words - 2} words"
+        yield c.take(4 * (words - 2)), plural(words - 2, "word")
     if escapes:
         yield c.take(escapes), "`escapes`"
 
 
-def hyper_tables(c: Cursor, count: int) -> Iterator[Row]:
+def tables(c: Cursor, count: int) -> Iterator[Row]:
     for i in range(count):
         raw, entries = c.varint()
         raw2, lowest = c.varint()
         yield raw + raw2, f"table {i}: {entries} entries from symbol {signed(lowest)} on"
-    yield from arrays(c, 1)
+    if count:
+        yield from arrays(c, 1)
 
 
-def networks(c: Cursor) -> Iterator[Row]:
+def networks(c: Cursor, names: list[str]) -> Iterator[Row]:
     total = 0
-    for name in ("reference", "covariance", "residual"):
+    for name in names:
         raw, layers = c.varint()
-        yield raw, f"{name} network: {layers} layer{'s' * (layers > 1)}"
+        flags = c.take(1)
+        skip = ", skip" * flags[0]
+        yield raw + flags, f"network of the {name}: {plural(layers, 'layer')}{skip}"
         for i in range(layers):
             total += 4
             raw, outputs = c.varint()
             flags = c.take(1)
-            rectify = ", rectify" if flags[0] >> 7 else ""
-            yield raw + flags, f"layer {i}: {outputs} outputs, shift {flags[0] & 127}{rectify}"
-    yield from arrays(c, total)
+            marks = ", rectify" * bool(flags[0] & RECTIFY) + ", adds" * bool(flags[0] & ADDS)
+            yield raw + flags, f"layer {i}: {outputs} outputs, shift {flags[0] & SHIFTS}{marks}"
+    if total:
+        yield from arrays(c, total)
 
 
 def heads(c: Cursor) -> Iterator[Row]:
@@ -159,6 +188,20 @@ def heads(c: Cursor) -> Iterator[Row]:
         yield from arrays(c, count)
 
 
+def latents(c: Cursor, content: FileContent) -> Iterator[Row]:
+    raw, level = c.varint()
+    yield raw, f"`level` {level}"
+    raw, anchors = c.varint()
+    yield raw, f"`anchors` {anchors}"
+    raw, coupled = c.varint()
+    yield raw, f"`coupled` {coupled}"
+    for i, part in enumerate(content.groups):
+        count = part.shape.channels * (coupled if part.shape.role == Role.RESIDUAL else anchors)
+        assert count <= CHUNK_SYMBOLS, "too large a file to be shown byte by byte"
+        for raw, meaning in stream(c) if count else ():
+            yield raw, f"group {i}: {meaning}"
+
+
 def metadata(c: Cursor) -> Iterator[Row]:
     raw, count = c.varint()
     yield raw, f"{count} entr{'y' if count == 1 else 'ies'}"
@@ -169,23 +212,31 @@ def metadata(c: Cursor) -> Iterator[Row]:
             yield raw + text, f"{what} `{text.decode()}`"
 
 
+def payload(c: Cursor) -> Iterator[Row]:
+    data = c.rest()
+    if data:
+        yield data, "payload"
+
+
 def rows(data: bytes) -> Iterator[Row]:
     """(bytes, meaning) of all pieces of a file, in order."""
-    content = read_content(data)
+    content = read_latents(data)[0]
     d = content.dimensions
+    names = [f"{name} (group {i})" for i, name in enumerate(group_names(d)) if d.groups[i].has_network]
+    readers: dict[int, Callable[[Cursor], Iterable[Row]]] = {
+        SCENE: scene,
+        POSITIONS: payload,
+        MASKS: payload,
+        TABLES: lambda c: tables(c, d.table_count),
+        NETWORKS: lambda c: networks(c, names),
+        HEADS: heads,
+        LATENTS: lambda c: latents(c, content),
+        METADATA: metadata,
+    }
     yield from header(data)
     for section in unpack(data):
         c = Cursor(section.data)
-        readers = {
-            SCENE: lambda c: scene(c),
-            HYPER_TABLES: lambda c: hyper_tables(c, d.reference_hyper_dim + d.residual_hyper_dim),
-            NETWORKS: networks,
-            HEADS: heads,
-            METADATA: metadata,
-            POSITIONS: lambda c: [(c.rest(), "payload")],
-            MASKS: lambda c: [(c.rest(), "payload")],
-        }
-        for raw, meaning in readers.get(section.number, stream)(c):
+        for raw, meaning in readers.get(section.number, payload)(c):
             yield raw, f"{section.name}: {meaning}"
         assert c.at == len(section.data), section.name
 
@@ -201,27 +252,27 @@ def table(data: bytes) -> str:
     return "\n".join(lines)
 
 
-def symbols(data: bytes) -> str:
-    content = read_content(data)
+def values(data: bytes) -> str:
+    """What the file's symbols, latents, tables and networks are."""
+    content, decoded = read_latents(data)
     lines = ["| | Values |", "|---|---|"]
-    for name in (
-        "coordinates",
-        "mask",
-        "reference_hyper",
-        "reference",
-        "covariance",
-        "residual_hyper",
-        "residual",
-    ):
-        lines.append(f"| {name} | {(getattr(content, name) * 1).tolist()} |")
-    for name, network in content.networks.items():
-        for i, layer in enumerate(network.layers):
-            lines.append(
-                f"| {name} network, layer {i} | W {layer.weight.tolist()}, b {layer.bias.tolist()} |"
-            )
+    lines.append(f"| coordinates | {content.coordinates.tolist()} |")
+    lines.append(f"| mask | {(content.mask * 1).tolist()} |")
+    for i, (part, fixed) in enumerate(zip(content.groups, decoded, strict=True)):
+        lines.append(f"| group {i}, symbols | {part.symbols.tolist()} |")
+        lines.append(f"| group {i}, latents times 4096 | {fixed.tolist()} |")
+        if not isinstance(part.prior, IntegerNetwork):
+            lines += [
+                f"| group {i}, levels of table {n} | {t.levels.tolist()} |" for n, t in enumerate(part.prior)
+            ]
+            continue
+        for n, layer in enumerate(part.prior.layers):
+            lines.append(f"| group {i}, layer {n} | W {layer.weight.tolist()}, b {layer.bias.tolist()} |")
+    for name, tensor in content.heads:
+        lines.append(f"| {name}, times 2^{tensor.exponent} | {tensor.values.tolist()} |")
     return "\n".join(lines)
 
 
 if __name__ == "__main__":
     file = Path(sys.argv[1]).read_bytes()
-    print(table(file), symbols(file), sep="\n\n")
+    print(table(file), values(file), sep="\n\n")

@@ -14,40 +14,75 @@ from pathlib import Path
 
 import numpy as np
 
-from compgs.codec.content import Dimensions, FileContent, Latents
+from compgs.codec.content import FileContent, GroupShape, Latents, Role
 from compgs.codec.format import MAX_SYMBOL
 from compgs.codec.reader import read_latents
+from compgs.codec.viewpoints import Viewpoint, Viewpoints
 from compgs.codec.writer import write_content
 
 ROOT = Path(__file__).parent.parent
 GOLDEN = ROOT / "tests" / "golden"
 sys.path.append(str(ROOT / "benchmarks"))
-from made_content import make_content  # noqa: E402
+from made_content import make_content, make_dimensions, paper_groups  # noqa: E402
 
-SYMBOLS = ("coordinates", "mask", "reference_hyper", "reference", "covariance", "residual_hyper", "residual")
-LATENTS = ("reference", "covariance", "residual")
+DEFAULT_STEPS = (0.125, 0.15, 0.1, 0.2, 0.25, 0.175)  # of the log scales, as training learns them: six
+
+# Several groups of a role, each given others; coordinates as context, beside latents and alone; tables for a group of
+# every role.
+ODD_GROUPS = (
+    GroupShape(Role.SIDE, 2),
+    GroupShape(Role.SIDE, 3, (), (0,)),
+    GroupShape(Role.REFERENCE, 4, (0.5,), (1,)),
+    GroupShape(Role.REFERENCE, 3, (1.0, 2.0, 0.25), (1, 2), sees_coordinates=True),
+    GroupShape(Role.REFERENCE, 2, (0.75,)),
+    GroupShape(Role.LOG_SCALES, 2, (0.25,)),
+    GroupShape(Role.LOG_SCALES, 4, (0.125, 0.25, 0.5, 0.0625), (), sees_coordinates=True),
+    GroupShape(Role.RESIDUAL, 1, (0.5,)),
+    GroupShape(Role.RESIDUAL, 2, (1.0, 0.5), (2, 3, 6), sees_coordinates=True),
+)
+
+VIEWPOINTS = Viewpoints(
+    up=(0.0, -0.6, 0.8),
+    views=(
+        Viewpoint((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 640, 480, 500.0, 510.0),
+        Viewpoint((0.5, -0.5, 0.5, 0.5), (2.0, 0.25, 1.0), 640, 480, 500.0, 510.0),
+        Viewpoint((0.0, 0.6, 0.0, 0.8), (-1.0, 2.0, 0.5), 480, 640, 450.5, 450.5),
+    ),
+)
 
 
-def contents() -> dict[str, FileContent]:
-    """By name: the smallest sensible file, one with the default dimensions, one with everything unusual."""
-    tiny = make_content(3, 1, Dimensions(2, 2, 2, 1, 1, "paired", 2), kept=0.7)
-    default = make_content(150, 2)
-    odd = make_content(70, 3, Dimensions(5, 7, 3, 2, 3, "separate", 8), kept=0.4, hidden=9)
-    for name in ("reference_hyper", "reference", "covariance", "residual_hyper"):
-        getattr(odd, name)[::9] *= 1000
-        getattr(odd, name)[4, -1] = -MAX_SYMBOL
-    odd.residual[odd.mask] += 300
-    return {
-        "tiny": tiny,
-        "default": default,
-        "odd": replace(odd, metadata={"note": "Ä", "creator": "made up"}),
-    }
+def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
+    """Content and levels of the ranges, by name: the smallest sensible file, one as the default preset makes it, one as
+    the paper's preset does, one with everything unusual.
+    """
+    tiny = make_content(3, 1, make_dimensions(2, paper_groups(2, 0, 1), width=2, residual_dim=2), kept=0.7)
+    default = make_content(800, 2, make_dimensions(5, paper_groups(12, 0)))
+    shapes = [g.shape for g in default.groups]
+    scales = replace(default.groups[2], shape=replace(shapes[2], steps=DEFAULT_STEPS))
+    default = replace(default, groups=(*default.groups[:2], scales))
+    paper = make_content(60, 4, make_dimensions(10, paper_groups(16, 4)), blocks=2, hidden=12)
+    return {"tiny": (tiny, None), "default": (default, None), "paper": (paper, None), "odd": odd()}
+
+
+def odd() -> tuple[FileContent, list[int]]:
+    content = make_content(70, 3, make_dimensions(5, ODD_GROUPS, "separate", 8), kept=0.4, blocks=1, hidden=9)
+    for i, group in enumerate(content.groups):
+        if group.shape.role == Role.RESIDUAL:
+            group.symbols[content.mask] += 300 * i
+            continue
+        group.symbols[::9] *= 1000
+        group.symbols[4, -1] = -MAX_SYMBOL
+        group.symbols[5, 0] = MAX_SYMBOL
+    content = replace(content, world_offset=(-1.5, 1e6, 0.1), metadata={"note": "Ä", "creator": "made up"})
+    return replace(content, viewpoints=VIEWPOINTS), [0, 4, 7]
 
 
 def hashes(content: FileContent, latents: Latents) -> dict[str, str]:
     """SHA-256 of each array as little-endian 32-bit integers (the mask as bytes), in canonical order."""
-    arrays = {name: getattr(content, name) for name in SYMBOLS}
-    arrays |= {f"{name}_latents": getattr(latents, name) for name in LATENTS}
+    arrays = {"coordinates": content.coordinates, "mask": content.mask}
+    for i, (group, values) in enumerate(zip(content.groups, latents, strict=True)):
+        name = f"group {i}, {group.shape.role.name.lower().replace('_', ' ')}"
+        arrays |= {f"{name}: symbols": group.symbols, f"{name}: latents": values}
     return {
         name: hashlib.sha256(array.astype("u1" if array.dtype == np.bool_ else "<i4").tobytes()).hexdigest()
         for name, array in arrays.items()
@@ -57,8 +92,8 @@ def hashes(content: FileContent, latents: Latents) -> dict[str, str]:
 def main() -> None:
     GOLDEN.mkdir(parents=True, exist_ok=True)
     pinned = {}
-    for name, content in contents().items():
-        data = write_content(content)
+    for name, (content, levels) in contents().items():
+        data = write_content(content, levels=levels)
         _write(GOLDEN / f"{name}.cgs", data)
         pinned[name] = {"file": hashlib.sha256(data).hexdigest(), **hashes(*read_latents(data))}
         print(f"{name}.cgs: {len(data)} bytes")

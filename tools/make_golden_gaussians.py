@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from compgs.codec.content import FileContent, Latents
+from compgs.codec.content import FileContent, Latents, Role
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.codec.reader import read_latents
 
@@ -35,19 +35,22 @@ def plain_content(content: FileContent, latents: Latents) -> Content:
     """What was read, as docs/bitstream_prediction.md names it, in the local frame and in float64."""
     heads = {name: tensor.values * 2.0**-tensor.exponent for name, tensor in content.heads}
 
-    def floats(fixed: np.ndarray, step: float) -> np.ndarray:
-        return fixed * (step * 2.0**-FRACTION_BITS)
+    def floats(role: Role) -> np.ndarray:
+        parts = [
+            fixed * (np.array(group.shape.steps) * 2.0**-FRACTION_BITS)
+            for group, fixed in zip(content.groups, latents, strict=True)
+            if group.shape.role == role
+        ]
+        return np.concatenate(parts, 1) if parts else np.zeros((0, 0))
 
     return Content(
         heads=heads,
-        layout=content.dimensions.heads,
+        layout=content.heads_layout,
         coordinates=content.coordinates,
         mask=content.mask,
-        references=floats(latents.reference, content.reference_step),
-        log_scales=floats(latents.covariance, content.covariance_step),
-        residuals=np.zeros((0, 0))
-        if "residuals" in heads
-        else floats(latents.residual, content.residual_step),
+        references=floats(Role.REFERENCE),
+        log_scales=floats(Role.LOG_SCALES),
+        residuals=floats(Role.RESIDUAL),
         voxel_size=content.voxel_size,
         view_distance_scale=content.view_distance_scale,
     )

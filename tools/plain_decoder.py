@@ -1,46 +1,240 @@
 """A decoder in plain Python, written from docs/bitstream.md alone: slow, and independent of the package.
 
-    python tools/plain_decoder.py FILE        prints coordinates, mask, symbols and latents as JSON
+    python tools/plain_decoder.py FILE [--prefix]        prints everything that the file holds as JSON
 
-It shows that the document is complete, and the tests hold the real decoder against it.
+It shows that the document is complete, and the tests hold the real decoder against it. Names are the document's.
 """
 
 import json
+import math
 import struct
 import sys
 import zlib
-from itertools import pairwise
+from bisect import bisect_right
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
-TABLES = Path(__file__).parent.parent / "src" / "compgs" / "codec" / "gaussian_tables.bin"
+GAUSSIAN_TABLES = Path(__file__).parent.parent / "src" / "compgs" / "codec" / "gaussian_tables.bin"
+
+MAGIC = b"\x93CGS"
+VERSION = 2
+OPTIONAL = 0x80
+MAX_SECTIONS = 64
+MAX_ANCHORS = 2**24
+MAX_COUPLED_PRIMITIVES = 64
+MAX_REFERENCE_DIM = 256
+MAX_RESIDUAL_DIM = 64
+MAX_SIDE_DIM = 64
+MAX_GROUPS = 16
+MAX_RANGES = 22
+MAX_TABLES = 256
+MAX_WIDTH = 1024
+MAX_SYMBOL = 2**18
+FREE_SYMBOLS, SYMBOLS_PER_BYTE = 2**20, 128
+FREE_NETWORK_PRODUCTS, NETWORK_PRODUCTS_PER_BYTE = 2**28, 2**15
+FREE_HEAD_PRODUCTS, HEAD_PRODUCTS_PER_BYTE = 2**30, 2**17
+MAX_METADATA_BYTES = 4096
+SMALLEST, LARGEST = 2.0**-64, 2.0**64
+MAX_HYPER_SYMBOLS = 1024
+MAX_LOWEST = 2**18
+MANTISSAS = (1024, 1116, 1217, 1327, 1448, 1579, 1722, 1878)
+CHUNK_SYMBOLS = 2**20
+SINGLE_STATE_SYMBOLS = 2**18
+MAX_ESCAPE_BYTES = 5
+ACTIVATION_LIMIT = 2**23
+MAX_SHIFT = 30
+BIAS_LIMIT = 2**31
+ACCUMULATOR_LIMIT = 2**52
+MAX_LAYERS = 8
+MAX_LAYER_WIDTH = 2**16
+MAX_TENSORS = 256
+MAX_NAME_BYTES = 64
+MAX_RANK = 4
+MAX_EXPONENT = 62
+MAX_WEIGHTS = 2**22
+MAX_LOW_BITS = 26
+
+SCENE, POSITIONS, GPCC, MASKS, TABLES, NETWORKS, HEADS, LATENTS = range(1, 9)
+METADATA, PADDING, VIEWPOINTS = 129, 130, 131
+NAMES = {
+    SCENE: "scene",
+    POSITIONS: "positions",
+    GPCC: "positions (G-PCC)",
+    MASKS: "masks",
+    TABLES: "tables",
+    NETWORKS: "entropy networks",
+    HEADS: "prediction heads",
+    LATENTS: "latents",
+    METADATA: "metadata",
+    PADDING: "padding",
+    VIEWPOINTS: "viewpoints",
+}
+SIDE, REFERENCE, LOG_SCALES, RESIDUAL = range(4)
+MOST_CHANNELS = {SIDE: MAX_SIDE_DIM, REFERENCE: MAX_REFERENCE_DIM, LOG_SCALES: 6, RESIDUAL: MAX_RESIDUAL_DIM}
+
+
+# ---- Errors, named after those of the document
+
+
+class Refused(Exception):
+    """What all of these are."""
+
+
+class NotACompGSFile(Refused):
+    """The first bytes are not those of a .cgs file."""
+
+
+class UnsupportedVersion(Refused):
+    """Another version, or a section that this one does not have."""
+
+
+class TruncatedSection(Refused):
+    """The file ends too early."""
+
+
+class CorruptSection(Refused):
+    """Something is not legal."""
+
+
+class MissingDependency(Refused):
+    """The file needs G-PCC: no fault of the file."""
+
+
+def require(legal: bool, name: str, found: str) -> None:
+    if not legal:
+        raise CorruptSection(f"{name}: {found}")
 
 
 # ---- Fields
 
 
 class Fields:
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes, name: str) -> None:
         self.data = data
+        self.name = name
         self.at = 0
 
+    def require(self, legal: bool, found: str) -> None:
+        require(legal, self.name, found)
+
+    def left(self) -> int:
+        return len(self.data) - self.at
+
     def take(self, count: int) -> bytes:
-        assert self.at + count <= len(self.data)
+        self.require(count <= self.left(), f"needs {count} bytes, {self.left()} are left")
         self.at += count
         return self.data[self.at - count : self.at]
 
-    def varint(self) -> int:
-        value = shift = 0
-        while True:
-            byte = self.take(1)[0]
-            value |= (byte & 127) << shift
-            shift += 7
-            if byte < 128:
-                return value
+    def unpack(self, layout: str) -> tuple:
+        return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
 
-    def signed(self) -> int:
-        v = self.varint()
-        return -(v + 1) // 2 if v % 2 else v // 2
+    def number(self, layout: str, lowest: float, highest: float, what: str) -> Any:
+        (value,) = self.unpack(layout)
+        self.require(lowest <= value <= highest, f"{what} is {value}, expected {lowest} to {highest}")
+        return value
+
+    def varint(self, lowest: int = 0, highest: int = 2**63 - 1, what: str = "number", most: int = 9) -> int:
+        value = 0
+        for place in range(most):
+            byte = self.take(1)[0]
+            value |= (byte & 127) << 7 * place
+            if byte < 128:
+                self.require(byte > 0 or place == 0, f"{what} has a spelling that is too long")
+                self.require(lowest <= value <= highest, f"{what} is {value}, expected {lowest} to {highest}")
+                return value
+        raise CorruptSection(f"{self.name}: {what} has more than {most} bytes")
+
+    def signed(
+        self, lowest: int = -(2**62), highest: int = 2**62, what: str = "number", most: int = 9
+    ) -> int:
+        v = self.varint(what=what, most=most)
+        value = -(v + 1) // 2 if v % 2 else v // 2
+        self.require(lowest <= value <= highest, f"{what} is {value}, expected {lowest} to {highest}")
+        return value
+
+    def end(self) -> None:
+        self.require(self.left() == 0, f"{self.left()} bytes are left over")
+
+
+# ---- Scene
+
+
+@dataclass(frozen=True)
+class Group:
+    role: int
+    channels: int
+    context: int
+    steps: list[float]
+
+    def slots(self, k: int) -> int:
+        return k if self.role == RESIDUAL else 1
+
+    def width(self, k: int) -> int:
+        return self.slots(k) * self.channels
+
+    def contexts(self) -> list[int]:
+        return [j for j in range(MAX_GROUPS) if self.context >> (j + 1) & 1]
+
+
+@dataclass(frozen=True)
+class Scene:
+    anchors: int
+    coupled: int
+    coupled_primitives: int
+    residual_dim: int
+    heads: int
+    width: int
+    voxel_size: float
+    world_offset: tuple[float, float, float]
+    view_distance_scale: float
+    background: tuple[float, float, float]
+    groups: tuple[Group, ...]
+
+    def network_size(self, group: Group) -> tuple[int, int]:
+        """Inputs and outputs."""
+        inputs = 3 * (group.context & 1) + sum(self.groups[j].channels for j in group.contexts())
+        return inputs, 2 * group.width(self.coupled_primitives)
+
+
+def read_scene(data: bytes) -> Scene:
+    fields = Fields(data, NAMES[SCENE])
+    anchors = fields.number("I", 1, MAX_ANCHORS, "anchors")
+    (coupled,) = fields.unpack("I")
+    k = fields.number("B", 1, MAX_COUPLED_PRIMITIVES, "coupled_primitives")
+    fields.require(coupled <= anchors * k, f"{coupled} coupled primitives in {anchors * k} slots")
+    residual_dim = fields.number("B", 1, MAX_RESIDUAL_DIM, "residual_dim")
+    heads = fields.number("B", 0, 1, "heads")
+    width = fields.number("H", 1, MAX_WIDTH, "width")
+    voxel_size = fields.number("d", SMALLEST, LARGEST, "voxel_size")
+    world_offset = tuple(fields.number("d", -LARGEST, LARGEST, "world_offset") for _ in range(3))
+    view_distance_scale = fields.number("d", SMALLEST, LARGEST, "view_distance_scale")
+    background = tuple(fields.number("f", -LARGEST, LARGEST, "background") for _ in range(3))
+    groups: list[Group] = []
+    for _ in range(fields.number("B", 1, MAX_GROUPS, "groups")):
+        groups.append(read_group(fields, groups, k))
+    fields.end()
+    channels = [sum(group.channels for group in groups if group.role == role) for role in range(4)]
+    fields.require(1 <= channels[REFERENCE] <= MAX_REFERENCE_DIM, f"reference_dim is {channels[REFERENCE]}")
+    fields.require(channels[LOG_SCALES] == 6, f"{channels[LOG_SCALES]} log scales, expected 6")
+    fields.require(channels[RESIDUAL] in (0, residual_dim), f"{channels[RESIDUAL]} channels of residuals")
+    numbers = (anchors, coupled, k, residual_dim, heads, width, voxel_size)
+    return Scene(*numbers, world_offset, view_distance_scale, background, tuple(groups))
+
+
+def read_group(fields: Fields, before: list[Group], k: int) -> Group:
+    role = fields.varint(0, 3, "role")
+    channels = fields.varint(1, MOST_CHANNELS[role], "channels")
+    context = fields.varint(0, 2 ** (len(before) + 1) - 1, "context")
+    count = fields.varint(0, channels, "steps")
+    fields.require(count in ((0,) if role == SIDE else (1, channels)), f"{count} steps")
+    steps = [fields.number("f", SMALLEST, LARGEST, "step") for _ in range(count)]
+    group = Group(role, channels, context, steps)
+    fields.require(all(before[j].role != RESIDUAL for j in group.contexts()), "residuals as context")
+    fields.require(context > 0 or group.width(k) <= MAX_TABLES, f"a group of {group.width(k)} tables")
+    return group
 
 
 # ---- Tables
@@ -51,18 +245,15 @@ class Table:
         assert sum(frequencies) == 65536 and min(frequencies) >= 1
         self.lowest = lowest
         self.escape = len(frequencies) - 1
-        self.starts = [sum(frequencies[:j]) for j in range(len(frequencies))]
+        self.starts = [0, *accumulate(frequencies[:-1])]
         self.frequencies = frequencies
 
     def entry(self, slot: int) -> int:
-        j = len(self.starts) - 1
-        while self.starts[j] > slot:
-            j -= 1
-        return j
+        return bisect_right(self.starts, slot) - 1
 
 
 def gaussian_tables() -> list[Table]:
-    data = TABLES.read_bytes()
+    data = GAUSSIAN_TABLES.read_bytes()
     assert zlib.crc32(data) == 0xAD3B4090
     numbers = list(struct.unpack(f"<{len(data) // 2}H", data))
     tables = []
@@ -74,129 +265,261 @@ def gaussian_tables() -> list[Table]:
     return tables
 
 
-def hyper_tables(data: bytes, count: int, gaussian: list[Table]) -> list[Table]:
-    fields = Fields(data)
-    ranges = [(fields.varint(), fields.signed()) for _ in range(count)]
-    (d,) = integer_arrays(fields, [sum(entries for entries, _ in ranges)], gaussian)
-    tables = []
-    for entries, lowest in ranges:
-        part, d = d[:entries], d[entries:]
-        levels = [sum(part[: j + 1]) for j in range(entries - 1)] + [part[-1]]
-        mantissas = [1024, 1116, 1217, 1327, 1448, 1579, 1722, 1878]
-        w = [mantissas[level % 8] << (level >> 3) for level in levels]
-        f = [1 + x * (65536 - entries) // sum(w) for x in w]
-        f[levels.index(max(levels))] += 65536 - sum(f)
-        tables.append(Table(lowest, f))
-    return tables
+def read_tables(data: bytes, scene: Scene, gaussian: list[Table]) -> dict[int, list[Table]]:
+    """By group: the tables of an anchor's symbols."""
+    fields = Fields(data, NAMES[TABLES])
+    widths = {i: g.width(scene.coupled_primitives) for i, g in enumerate(scene.groups) if g.context == 0}
+    heads = [
+        (
+            fields.varint(2, MAX_HYPER_SYMBOLS + 1, "entries"),
+            fields.signed(-MAX_LOWEST, MAX_LOWEST, "lowest"),
+        )
+        for _ in range(sum(widths.values()))
+    ]
+    if not heads:
+        fields.end()
+        return {}
+    (differences,) = integer_arrays(fields, [sum(entries for entries, _ in heads)], gaussian)
+    d = iter(differences)
+    tables = iter([table_of(fields, lowest, [next(d) for _ in range(m)]) for m, lowest in heads])
+    return {i: [next(tables) for _ in range(width)] for i, width in widths.items()}
+
+
+def table_of(fields: Fields, lowest: int, d: list[int]) -> Table:
+    levels = [*accumulate(d[:-1]), d[-1]]
+    fields.require(min(levels) >= 0 and max(levels) <= 127, "a level is not in 0 ... 127")
+    w = [MANTISSAS[level % 8] << (level >> 3) for level in levels]
+    f = [1 + x * (65536 - len(w)) // sum(w) for x in w]
+    f[levels.index(max(levels))] += 65536 - sum(f)
+    return Table(lowest, f)
 
 
 # ---- Streams
 
 
-def stream(data: bytes, tables: list[Table]) -> list[int]:
+def read_stream(fields: Fields, tables: list[Table]) -> list[int]:
     """One symbol for each of the tables."""
     if not tables:
-        assert not data
         return []
-    fields = Fields(data)
-    chunks = [tables[i : i + 2**20] for i in range(0, len(tables), 2**20)]
-    words = [fields.varint() for _ in chunks]
-    escape_bytes = fields.varint()
-    symbols: list[int | None] = []
+    chunks = [tables[i : i + CHUNK_SYMBOLS] for i in range(0, len(tables), CHUNK_SYMBOLS)]
+    words = [fields.varint(2, len(chunk) // 2 + 5, "words") for chunk in chunks]
+    escape_bytes = fields.varint(0, MAX_ESCAPE_BYTES * len(tables), "escape_bytes")
+    entries = []
     for chunk, count in zip(chunks, words, strict=True):
-        values = list(struct.unpack(f"<{count}I", fields.take(4 * count)))
-        states = []
-        for _ in range(1 if len(chunk) < 2**18 else 2):
-            states.append(values[0] + 2**32 * values[1])
-            values = values[2:]
-        for i, table in enumerate(chunk):
-            k = i % len(states)
-            slot = states[k] % 65536
-            j = table.entry(slot)
-            states[k] = table.frequencies[j] * (states[k] // 65536) + slot - table.starts[j]
-            if states[k] < 2**31:
-                states[k] = 2**32 * states[k] + values.pop(0)
-            symbols.append(None if j == table.escape else table.lowest + j)
-        assert not values and all(state == 2**31 for state in states)
-    escapes = Fields(fields.take(escape_bytes))
-    out = []
-    for symbol, table in zip(symbols, tables, strict=True):
-        if symbol is None:
-            v = escapes.varint()
-            symbol = table.lowest - 1 - (v - 1) // 2 if v % 2 else table.lowest + table.escape + v // 2
-        out.append(symbol)
-    assert escapes.at == escape_bytes and fields.at == len(data)
-    return out
+        entries += chunk_entries(fields, chunk, iter(fields.unpack(f"{count}I")))
+    escapes = Fields(fields.take(escape_bytes), fields.name)
+    symbols = [
+        escaped(escapes, table) if j == table.escape else table.lowest + j
+        for j, table in zip(entries, tables, strict=True)
+    ]
+    escapes.end()
+    return symbols
+
+
+def chunk_entries(fields: Fields, chunk: list[Table], words: Iterator[int]) -> list[int]:
+    def word() -> int:
+        value = next(words, None)
+        fields.require(value is not None, "a chunk has too few words")
+        return value or 0
+
+    states = []
+    for _ in range(1 if len(chunk) < SINGLE_STATE_SYMBOLS else 2):
+        low = word()
+        states.append(low + 2**32 * word())
+    fields.require(all(2**31 <= state < 2**63 for state in states), "a state is out of range")
+    entries = []
+    for i, table in enumerate(chunk):
+        k = i % len(states)
+        slot = states[k] % 65536
+        j = table.entry(slot)
+        states[k] = table.frequencies[j] * (states[k] // 65536) + slot - table.starts[j]
+        if states[k] < 2**31:
+            states[k] = 2**32 * states[k] + word()
+        entries.append(j)
+    fields.require(next(words, None) is None, "a chunk has too many words")
+    fields.require(all(state == 2**31 for state in states), "a state does not end where it began")
+    return entries
+
+
+def escaped(escapes: Fields, table: Table) -> int:
+    v = escapes.varint(most=MAX_ESCAPE_BYTES)
+    symbol = table.lowest - 1 - (v - 1) // 2 if v % 2 else table.lowest + table.escape + v // 2
+    escapes.require(-(2**31) <= symbol < 2**31, f"symbol {symbol} has more than 32 bits")
+    return symbol
 
 
 # ---- Arrays of integers, networks, heads
 
 
 def integer_arrays(fields: Fields, sizes: list[int], gaussian: list[Table]) -> list[list[int]]:
-    settings = [(fields.take(1)[0], fields.take(1)[0]) for _ in sizes]
-    data = fields.take(fields.varint())
+    settings = [
+        (fields.number("B", 0, len(gaussian) - 1, "table"), fields.number("B", 0, MAX_LOW_BITS, "low_bits"))
+        for _ in sizes
+    ]
+    stream_bytes = fields.varint(0, what="stream_bytes")
+    stream = Fields(fields.take(stream_bytes), fields.name)
     of_element = [setting for size, setting in zip(sizes, settings, strict=True) for _ in range(size)]
-    highs = stream(data, [gaussian[table] for table, _ in of_element])
-    bits = "".join(f"{byte:08b}" for byte in fields.take(len(fields.data) - fields.at))
+    highs = read_stream(stream, [gaussian[table] for table, _ in of_element])
+    stream.end()
+    needed = sum(low_bits for _, low_bits in of_element)
+    fields.require(fields.left() == -(-needed // 8), f"{fields.left()} bytes for {needed} low bits")
+    bits = "".join(f"{byte:08b}" for byte in fields.take(fields.left()))
+    fields.require("1" not in bits[needed:], "bits behind the last low part")
     values = []
     at = 0
     for high, (_, low_bits) in zip(highs, of_element, strict=True):
         low = int(bits[at : at + low_bits] or "0", 2)
         at += low_bits
         values.append(high * 2**low_bits + low - 2**low_bits // 2)
-    assert len(bits) - at < 8 and "1" not in bits[at:]
-    arrays = []
-    for size in sizes:
-        arrays.append(values[:size])
-        values = values[size:]
-    return arrays
+    fields.require(all(-(2**31) <= v < 2**31 for v in values), "an element has more than 32 bits")
+    rest = iter(values)
+    return [[next(rest) for _ in range(size)] for size in sizes]
 
 
-def entropy_networks(
-    data: bytes, inputs_outputs: list[tuple[int, int]], gaussian: list[Table]
-) -> list[list[dict]]:
-    fields = Fields(data)
-    networks: list[list[dict]] = []
+@dataclass(frozen=True)
+class Layer:
+    inputs: int
+    outputs: int
+    shift: int
+    adds: bool
+    rectify: bool
+
+
+@dataclass(frozen=True)
+class Network:
+    layers: list[Layer]
+    skip: bool
+    weights: list[list[list[int]]]  # of each layer [outputs][inputs]
+    biases: list[list[int]]
+
+
+def read_networks(
+    data: bytes, scene: Scene, anchors: int, n: int, gaussian: list[Table]
+) -> dict[int, Network]:
+    """By group. n: the length of the file, which pays for the products with the anchors."""
+    fields = Fields(data, NAMES[NETWORKS])
+    shapes = {i: read_layers(fields, *scene.network_size(g)) for i, g in enumerate(scene.groups) if g.context}
+    if not shapes:
+        fields.end()
+        return {}
+    layers = [layer for layers, _ in shapes.values() for layer in layers]
+    weights = sum(layer.inputs * layer.outputs for layer in layers)
+    allowed = FREE_NETWORK_PRODUCTS + NETWORK_PRODUCTS_PER_BYTE * n
+    fields.require(anchors * weights <= allowed, f"{anchors * weights} products, expected up to {allowed}")
+    elements = weights + sum(layer.outputs for layer in layers)
+    fields.require(elements <= MAX_WEIGHTS, f"{elements} elements, expected up to {MAX_WEIGHTS}")
     sizes = []
-    for inputs, outputs in inputs_outputs:
-        layers = []
-        for _ in range(fields.varint()):
-            o, flags = fields.varint(), fields.take(1)[0]
-            layers.append({"inputs": inputs, "shift": flags & 127, "rectify": flags >> 7})
-            first = (o + 1) // 2
-            sizes += [first * inputs, (o - first) * inputs, first, o - first]
-            inputs = o
-        assert inputs == outputs
-        networks.append(layers)
-    arrays = integer_arrays(fields, sizes, gaussian)
-    for layer in (layer for layers in networks for layer in layers):
-        upper, lower, b1, b2 = arrays[:4]
-        arrays = arrays[4:]
-        weights = upper + lower
-        n = layer["inputs"]
-        layer["W"] = [weights[i : i + n] for i in range(0, len(weights), n)]
-        layer["b"] = b1 + b2
+    for layer in layers:
+        upper = (layer.outputs + 1) // 2
+        lower = layer.outputs - upper
+        sizes += [upper * layer.inputs, lower * layer.inputs, upper, lower]
+    arrays = iter(integer_arrays(fields, sizes, gaussian))
+    networks = {}
+    for i, (layers, skip) in shapes.items():
+        parameters = [read_parameters(fields, layer, arrays) for layer in layers]
+        networks[i] = Network(layers, skip, [w for w, _ in parameters], [b for _, b in parameters])
     return networks
+
+
+def read_layers(fields: Fields, inputs: int, outputs: int) -> tuple[list[Layer], bool]:
+    count = fields.varint(1, MAX_LAYERS, "layers")
+    skip = fields.number("B", 0, int(count > 1), "flags of a network") == 1
+    layers: list[Layer] = []
+    for i in range(count):
+        width = fields.varint(1, MAX_LAYER_WIDTH, "width")
+        flags = fields.number("B", 0, 255, "flags")
+        last = i == count - 1
+        taken = inputs if i == 0 else layers[-1].outputs + inputs * (last and skip)
+        layer = Layer(taken, width, flags & 31, bool(flags & 64), bool(flags & 128))
+        fields.require(not flags & 32 and layer.shift <= MAX_SHIFT, f"flags of a layer are {flags}")
+        if layer.adds:
+            fields.require(i > 0 and not last, "the first or last layer adds")
+            fields.require(width == layers[-1].inputs, f"{width} outputs are added to {layers[-1].inputs}")
+        fields.require(not last or width == outputs, f"the last layer has {width} outputs, not {outputs}")
+        layers.append(layer)
+    return layers, skip
+
+
+def read_parameters(
+    fields: Fields, layer: Layer, arrays: Iterator[list[int]]
+) -> tuple[list[list[int]], list[int]]:
+    weights = next(arrays) + next(arrays)
+    biases = next(arrays) + next(arrays)
+    largest = max(map(abs, weights))
+    fields.require(layer.inputs * largest * ACTIVATION_LIMIT < ACCUMULATOR_LIMIT, f"a weight of {largest}")
+    fields.require(all(abs(b) < BIAS_LIMIT for b in biases), "a bias of 2^31")
+    return rows(weights, layer.inputs), biases
 
 
 def clamp(v: int, lowest: int, highest: int) -> int:
     return min(max(v, lowest), highest)
 
 
-def evaluate(layers: list[dict], x: list[int]) -> list[int]:
-    x = [clamp(v, -(2**23), 2**23 - 1) for v in x]
-    for layer in layers:
+def activation(v: int) -> int:
+    return clamp(v, -ACTIVATION_LIMIT, ACTIVATION_LIMIT - 1)
+
+
+def evaluate(network: Network, inputs: list[int]) -> list[int]:
+    x = inputs = [activation(v) for v in inputs]
+    before: list[int] = []  # what the layer before took
+    for i, layer in enumerate(network.layers):
+        if network.skip and i == len(network.layers) - 1:
+            x = x + inputs
         out = []
-        for row, bias in zip(layer["W"], layer["b"], strict=True):
+        for o, (row, bias) in enumerate(zip(network.weights[i], network.biases[i], strict=True)):
             y = sum(w * v for w, v in zip(row, x, strict=True))
-            if layer["shift"] > 0:
-                y = (y + 2 ** (layer["shift"] - 1)) >> layer["shift"]
+            if layer.shift > 0:
+                y = (y + 2 ** (layer.shift - 1)) >> layer.shift
             y += bias
-            if layer["rectify"]:
+            if layer.rectify:
                 y = max(y, y >> 6)
-            out.append(clamp(y, -(2**23), 2**23 - 1))
-        x = out
+            y = activation(y)
+            out.append(activation(y + before[o]) if layer.adds else y)
+        before, x = x, out
     return x
+
+
+def read_heads(data: bytes, coupled: int, n: int, gaussian: list[Table]) -> dict[str, dict[str, Any]]:
+    fields = Fields(data, NAMES[HEADS])
+    tensors: dict[str, dict[str, Any]] = {}
+    name = b""
+    for _ in range(fields.varint(0, MAX_TENSORS, "tensors")):
+        name = read_name(fields, name)
+        sides = [fields.varint(0, MAX_LAYER_WIDTH, "side") for _ in range(fields.varint(0, MAX_RANK, "rank"))]
+        exponent = fields.signed(-MAX_EXPONENT, MAX_EXPONENT, "exponent")
+        fields.require(name.decode() not in tensors, f"{name.decode()} twice")
+        tensors[name.decode()] = {"shape": sides, "exponent": exponent}
+    if not tensors:
+        fields.end()
+        return {}
+    sizes = [math.prod(tensor["shape"]) for tensor in tensors.values()]
+    fields.require(sum(sizes) <= MAX_WEIGHTS, f"{sum(sizes)} elements, expected up to {MAX_WEIGHTS}")
+    allowed = FREE_HEAD_PRODUCTS + HEAD_PRODUCTS_PER_BYTE * n
+    fields.require(
+        coupled * sum(sizes) <= allowed, f"{coupled * sum(sizes)} products, expected up to {allowed}"
+    )
+    for tensor, values in zip(tensors.values(), integer_arrays(fields, sizes, gaussian), strict=True):
+        tensor["values"] = values
+    return tensors
+
+
+def read_name(fields: Fields, before: bytes) -> bytes:
+    shared = fields.varint(0, len(before), "shared")
+    rest = fields.take(fields.varint(0, MAX_NAME_BYTES, "rest"))
+    name = before[:shared] + rest
+    fields.require(1 <= len(name) <= MAX_NAME_BYTES, f"a name of {len(name)} bytes")
+    fields.require(
+        before[shared : shared + 1] != rest[:1] or not rest, f"a name shares more than {shared} bytes"
+    )
+    text(fields, name)
+    return name
+
+
+def text(fields: Fields, data: bytes) -> str:
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        raise CorruptSection(f"{fields.name}: {data!r} is not UTF-8") from None
 
 
 # ---- Arithmetic code
@@ -238,8 +561,9 @@ class State:
 
 
 class ArithmeticDecoder:
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes, name: str) -> None:
         self.data = data
+        self.name = name
         self.low, self.high = 0, 2**48 - 1
         self.code = int.from_bytes(data[:6].ljust(6, b"\0"), "big")
         self.rounds = 0
@@ -267,7 +591,8 @@ class ArithmeticDecoder:
 
     def end(self) -> int:
         """Bytes that the code took."""
-        assert self.code == ((self.low >> 40) + 1) << 40
+        require(self.code == ((self.low >> 40) + 1) << 40, self.name, "the code does not end as it should")
+        require(self.rounds + 1 <= len(self.data), self.name, "the code ends early")
         return self.rounds + 1
 
 
@@ -358,11 +683,46 @@ def single_anchor(
     return (v[0], v[1], v[2])
 
 
-def positions(data: bytes, anchors: int) -> list[Cell]:
-    fields = Fields(data)
-    depth = fields.take(1)[0]
-    origin = (16 * fields.signed(), 16 * fields.signed(), 16 * fields.signed())
-    coder = ArithmeticDecoder(data[fields.at :])
+@dataclass(frozen=True)
+class Positions:
+    """Of all anchors, in canonical order."""
+
+    depth: int
+    coordinates: list[Cell]
+    offsets: list[Cell]
+    levels: list[int]
+
+    def context(self, i: int) -> list[int]:
+        """What a network takes of an anchor's coordinates."""
+        return [((2 * o + 1 << 12) >> self.depth) - 4096 for o in self.offsets[i]]
+
+
+def read_positions(data: bytes, anchors: int) -> Positions:
+    fields = Fields(data, NAMES[POSITIONS])
+    fields.require(4 * len(data) >= anchors, f"{len(data)} bytes for {anchors} anchors")
+    depth = fields.number("B", 0, 21, "depth")
+    fields.require(anchors <= 8**depth, f"{anchors} anchors in {8**depth} voxels")
+    x, y, z = (16 * fields.signed(what="origin", most=4) for _ in range(3))
+    coder = ArithmeticDecoder(data[fields.at :], fields.name)
+    offsets = walk(coder, depth, anchors)
+    used = fields.at + coder.end()
+    fields.require(len(data) == max(used, -(-anchors // 4)), f"{len(data) - used} bytes are left over")
+    fields.require(not any(data[used:]), "the bytes left over are not zero")
+    lowest = [min(v[axis] for v in offsets) for axis in range(3)]
+    largest = max(max(v) for v in offsets)
+    fields.require(max(lowest) < 16, f"the smallest offsets are {lowest}, expected below 16")
+    fields.require(largest.bit_length() == depth, f"depth is {depth}, expected {largest.bit_length()}")
+    coordinates = [moved((x, y, z), v) for v in offsets]
+    fields.require(
+        all(-(2**31) <= c < 2**31 for v in coordinates for c in v), "a coordinate has over 32 bits"
+    )
+    order = canonical(offsets, depth)
+    offsets = [v for _, v in order]
+    return Positions(depth, [moved((x, y, z), v) for v in offsets], offsets, [level for level, _ in order])
+
+
+def walk(coder: ArithmeticDecoder, depth: int, anchors: int) -> list[Cell]:
+    """Offsets, in the order of the code."""
     direct = [State() for _ in range(368)]
     occupancy = Mixer(7, 16384, 400, 4)
     single = Mixer(5, 16384, 400, 4)
@@ -378,7 +738,7 @@ def positions(data: bytes, anchors: int) -> list[Cell]:
             exists[(v[0] >> height + 1, v[1] >> height + 1, v[2] >> height + 1)] = "single"
             state[(v[0] >> height, v[1] >> height, v[2] >> height)] = OCCUPIED
         following: list[tuple[Cell, int, int]] = []
-        for node, parents_children, index in waiting:
+        for place, (node, parents_children, index) in enumerate(waiting):
             near = [moved(node, d) in exists for d in AROUND]
             neighbours = sum(near)
             crowds = sum(exists.get(moved(node, d)) == "waiting" for d in AROUND)
@@ -455,29 +815,31 @@ def positions(data: bytes, anchors: int) -> list[Cell]:
                 else:
                     following.append((own, children, c))
                     shared += 1
+            found = len(offsets) + 2 * (len(waiting) - place - 1 + len(following))
+            require(found <= anchors, coder.name, f"{found} or more anchors turn up, expected {anchors}")
         waiting = following
-    assert len(offsets) == anchors
-    used = fields.at + coder.end()
-    assert len(data) == max(used, -(-anchors // 4)) and not any(data[used:])
-    return [moved(origin, v) for v in canonical(offsets, depth)]
+    require(len(offsets) == anchors, coder.name, f"{len(offsets)} anchors turn up, expected {anchors}")
+    return offsets
 
 
-def canonical(offsets: list[Cell], depth: int) -> list[Cell]:
+def canonical(offsets: list[Cell], depth: int) -> list[tuple[int, Cell]]:
+    """Level and offset of each."""
     codes = sorted((morton(v, depth), v) for v in offsets)
     levels = [0]
     for (before, _), (code, _) in pairwise(codes):
         highest = max(d for d in range(depth) if (before ^ code) >> 3 * d & 7)
         levels.append(depth - highest)
-    return [v for _, _, v in sorted((level, code, v) for level, (code, v) in zip(levels, codes, strict=True))]
+    order = sorted((level, code, v) for level, (code, v) in zip(levels, codes, strict=True))
+    return [(level, v) for level, _, v in order]
 
 
 # ---- Masks
 
 
-def masks(data: bytes, anchors: int, slots: int) -> list[list[int]]:
+def read_masks(data: bytes, anchors: int, slots: int) -> list[list[int]]:
     if not data:
         return [[1] * slots for _ in range(anchors)]
-    coder = ArithmeticDecoder(data)
+    coder = ArithmeticDecoder(data, NAMES[MASKS])
     mixer = Mixer(3, 24576, 1000, 2)
     rows = [[0] * slots, [0] * slots]
     for _ in range(anchors):
@@ -489,75 +851,297 @@ def masks(data: bytes, anchors: int, slots: int) -> list[list[int]]:
             contexts = [65 * k + sum(row), 256 * k + recent, third]
             row.append(mixer.decide(coder, contexts, k, 64 + 2 * one + two, k))
         rows.append(row)
-    assert coder.end() == len(data) and any(0 in row for row in rows[2:])
+    require(coder.end() == len(data), coder.name, "bytes are left over")
+    require(any(0 in row for row in rows[2:]), coder.name, "every flag is 1, which takes no bytes")
     return rows[2:]
+
+
+# ---- Latents
+
+
+def rows(values: list, width: int) -> list[list]:
+    return [values[i : i + width] for i in range(0, len(values), width)]
+
+
+@dataclass(frozen=True)
+class RangeHead:
+    level: int
+    anchors: int
+    coupled: int
+
+
+def read_range_heads(sections: list[Fields]) -> list[RangeHead]:
+    return [RangeHead(fields.varint(), fields.varint(1), fields.varint()) for fields in sections]
+
+
+def check_ranges(heads: list[RangeHead], whole: bool, positions: Positions, mask: list[list[int]]) -> None:
+    """whole: the last of them is the last one of the file."""
+    name = NAMES[LATENTS]
+    begin, before = 0, -1
+    for head in heads:
+        require(before < head.level <= positions.depth, name, f"level {head.level} after {before}")
+        end = sum(level <= head.level for level in positions.levels)
+        require(head.anchors == end - begin, name, f"{head.anchors} anchors, expected {end - begin}")
+        coupled = sum(map(sum, mask[begin:end]))
+        require(head.coupled == coupled, name, f"{head.coupled} coupled primitives, expected {coupled}")
+        begin, before = end, head.level
+    require(not whole or before == positions.depth, name, f"the last level is {before}")
+
+
+@dataclass(frozen=True)
+class Model:
+    """Where each group's tables come from."""
+
+    scene: Scene
+    tables: dict[int, list[Table]]
+    networks: dict[int, Network]
+    gaussian: list[Table]
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Of one group: a row an anchor, or a row a coupled primitive that exists."""
+
+    symbols: list[list[int]]
+    latents: list[list[int]]
+
+
+def read_group_symbols(
+    fields: Fields, model: Model, i: int, existing: list[list[int]], inputs: list[list[int]]
+) -> Decoded:
+    """existing: of each anchor, the slots that have symbols. inputs: of each anchor, what the network takes."""
+    group = model.scene.groups[i]
+    means: list[int] = []
+    tables: list[Table] = []
+    for slots, x in zip(existing, inputs, strict=True):
+        channels = [slot * group.channels + c for slot in slots for c in range(group.channels)]
+        if i in model.networks:
+            y = evaluate(model.networks[i], x)
+            scales = y[len(y) // 2 :]
+            means += [y[c] for c in channels]
+            tables += [model.gaussian[clamp((scales[c] + 2048) >> 12, 0, 127)] for c in channels]
+        else:
+            means += [0] * len(channels)
+            tables += [model.tables[i][c] for c in channels]
+    symbols = read_stream(fields, tables)
+    fields.require(all(abs(q) <= MAX_SYMBOL for q in symbols), f"a symbol beyond {MAX_SYMBOL}")
+    latents = [(q << 12) + mean for q, mean in zip(symbols, means, strict=True)]
+    return Decoded(rows(symbols, group.channels), rows(latents, group.channels))
+
+
+def read_range(fields: Fields, model: Model, places: list[list[int]], mask: list[list[int]]) -> list[Decoded]:
+    """places: coordinates of the range's anchors as networks take them; mask: of the same anchors."""
+    decoded: list[Decoded] = []
+    for i, group in enumerate(model.scene.groups):
+        existing = [
+            [slot for slot, bit in enumerate(row) if bit] if group.role == RESIDUAL else [0] for row in mask
+        ]
+        sources = [places] if group.context & 1 else []
+        sources += [decoded[j].latents for j in group.contexts()]
+        inputs = [[v for source in sources for v in source[a]] for a in range(len(mask))]
+        decoded.append(read_group_symbols(fields, model, i, existing, inputs))
+    fields.end()
+    return decoded
+
+
+# ---- Viewpoints, metadata, padding
+
+
+def read_viewpoints(data: bytes) -> dict[str, Any]:
+    fields = Fields(data, NAMES[VIEWPOINTS])
+    up = fields.unpack("3b")
+    fields.require(any(up) and min(up) >= -127, f"up is {up}")
+    centre = fields.unpack("3f")
+    fields.require(all(map(math.isfinite, centre)), f"centre is {centre}")
+    radius = positive(fields, "radius")
+    lenses = []
+    for _ in range(fields.number("B", 1, 16, "lenses")):
+        size = [fields.number("H", 1, 65535, "size of a lens") for _ in range(2)]
+        lenses.append([*size, positive(fields, "focal length"), positive(fields, "focal length")])
+    views = []
+    for _ in range(fields.number("B", 1, 255, "views")):
+        lens = lenses[fields.number("B", 0, len(lenses) - 1, "lens")]
+        position = [fields.number("h", -32767, 32767, "position") for _ in range(3)]
+        center = [c + radius * p / 32767 for c, p in zip(centre, position, strict=True)]
+        rotation = read_rotation(fields)
+        views.append({"lens": lens, "center": center, "rotation": rotation})
+    fields.end()
+    return {"up": [v / 127 for v in up], "views": views}
+
+
+def positive(fields: Fields, what: str) -> float:
+    (value,) = fields.unpack("f")
+    fields.require(0 < value < math.inf, f"{what} is {value}")
+    return value
+
+
+def read_rotation(fields: Fields) -> list[float]:
+    bits = int.from_bytes(fields.take(6), "little")
+    fields.require(bits >> 47 == 0, "bit 47 of a rotation is not 0")
+    largest = bits & 3
+    numbers = [(bits >> 2 + 15 * i) & 0x7FFF for i in range(3)]
+    numbers = [v - 2**15 if v >= 2**14 else v for v in numbers]
+    squares = sum(v * v for v in numbers)
+    fields.require(min(numbers) >= -16383, f"a rotation has {numbers}, expected -16383 or more")
+    fields.require(squares <= 3 * 2**27, f"a rotation has {numbers}: the fourth is not the largest")
+    rotation = [v / (16383 * math.sqrt(2)) for v in numbers]
+    rotation.insert(largest, math.sqrt(1 - squares / (2 * 16383**2)))
+    return rotation
+
+
+def read_metadata(data: bytes) -> dict[str, str]:
+    fields = Fields(data, NAMES[METADATA])
+    fields.require(len(data) <= MAX_METADATA_BYTES, f"{len(data)} bytes, expected up to {MAX_METADATA_BYTES}")
+    metadata: dict[str, str] = {}
+    before = None
+    for _ in range(fields.varint()):
+        key = fields.take(fields.varint())
+        fields.require(before is None or before < key, f"{key!r} after {before!r}")
+        metadata[text(fields, key)] = text(fields, fields.take(fields.varint()))
+        before = key
+    fields.end()
+    return metadata
 
 
 # ---- File
 
 
-def decode(data: bytes) -> dict[str, Any]:
-    """Everything with one row an anchor, in canonical order; residuals by slot, None where nothing exists."""
-    assert data[:6] == b"\x93CGS\x01\x00"
+@dataclass(frozen=True)
+class File:
+    sections: dict[int, bytes]  # but for the latents
+    latents: list[bytes]  # those that are there
+    whole: bool  # all of them are
+
+
+def check_head(data: bytes) -> list[tuple[int, int, int]]:
+    """Number, length and checksum of each section: rows 1 to 9 of what a decoder must refuse."""
+    if data[:4] != MAGIC[: len(data)]:
+        raise NotACompGSFile("the first bytes are not those of a .cgs file")
+    if len(data) < 7:
+        raise TruncatedSection(f"the header ends after {len(data)} bytes")
+    if data[4] != VERSION:
+        raise UnsupportedVersion(f"version {data[4]}, expected {VERSION}")
     count = data[6]
     end = 7 + 9 * count
-    assert zlib.crc32(data[:end]) == struct.unpack_from("<I", data, end)[0]
-    sections = {}
-    at = end + 4
-    for i in range(count):
-        number, length, crc = struct.unpack_from("<BII", data, 7 + 9 * i)
-        sections[number] = data[at : at + length]
-        assert zlib.crc32(sections[number]) == crc
+    if len(data) < end + 4:
+        raise TruncatedSection(f"the header has {end + 4} bytes, the file {len(data)}")
+    require(zlib.crc32(data[:end]) == struct.unpack_from("<I", data, end)[0], "header", "the checksum")
+    require(data[5] == 0, "header", f"flags are {data[5]}")
+    require(count <= MAX_SECTIONS, "header", f"{count} sections, expected up to {MAX_SECTIONS}")
+    table = [struct.unpack_from("<BII", data, 7 + 9 * i) for i in range(count)]
+    check_numbers([number for number, _, _ in table])
+    return table
+
+
+def check_numbers(numbers: list[int]) -> None:
+    required = [number for number in numbers if number < OPTIONAL]
+    unknown = [number for number in required if number not in NAMES]
+    if unknown:
+        raise UnsupportedVersion(f"section {unknown[0]} is of a later version")
+    require(required == sorted(required), "header", f"sections {required} do not ascend")
+    once = [number for number in numbers if number != LATENTS]
+    require(len(set(once)) == len(once), "header", "a section is there twice")
+    needed = {SCENE, MASKS, TABLES, NETWORKS, HEADS, LATENTS}
+    require(needed <= set(required), "header", f"sections {sorted(needed - set(required))} are missing")
+    require((POSITIONS in required) != (GPCC in required), "header", "not exactly one section of positions")
+    ranges = required.count(LATENTS)
+    require(ranges <= MAX_RANGES, "header", f"{ranges} sections of latents, expected up to {MAX_RANGES}")
+
+
+def read_file(data: bytes, prefix: bool) -> File:
+    table = check_head(data)
+    at = 11 + 9 * len(table)
+    sections: dict[int, bytes] = {}
+    latents: list[bytes] = []
+    for number, length, checksum in table:
+        name = NAMES.get(number, f"section {number}")
+        if at + length > len(data):
+            if prefix and latents:
+                break
+            raise TruncatedSection(f"{name}: {length} bytes are promised, {len(data) - at} are there")
+        payload = data[at : at + length]
+        require(zlib.crc32(payload) == checksum, name, "the checksum does not match")
+        if number == LATENTS:
+            latents.append(payload)
+        else:
+            sections[number] = payload
         at += length
-    assert at == len(data)
-    n, p, k, fd, gd, zf, zg, _, _ = struct.unpack_from("<IIBHBBBBH", sections[1])
-    gaussian = gaussian_tables()
-    hyper = hyper_tables(sections[4], zf + zg, gaussian)
-    sizes = [(zf, 2 * fd), (fd, 12), (zg + fd, 2 * k * gd)]
-    reference_network, covariance_network, residual_network = entropy_networks(sections[5], sizes, gaussian)
-    coordinates = positions(sections[2], n)
-    mask = masks(sections[3], n, k)
-    assert sum(map(sum, mask)) == p
+    else:
+        require(at == len(data), "file", f"{len(data) - at} bytes after the last section")
+    return File(sections, latents, len(latents) == sum(number == LATENTS for number, _, _ in table))
 
-    def rows(values: list[int], width: int) -> list[list[int]]:
-        return [values[i : i + width] for i in range(0, len(values), width)]
 
-    def conditional(
-        number: int, network: list[dict], context: list[list[int]], width: int, slots: list[list[int]]
-    ):
-        means, tables = [], []
-        for x, row in zip(context, slots, strict=True):
-            y = evaluate(network, x)
-            half = len(y) // 2
-            for slot in (s for s, bit in enumerate(row) if bit):
-                channels = range(slot * width, (slot + 1) * width)
-                means += [y[c] for c in channels]
-                tables += [gaussian[clamp((y[half + c] + 2048) >> 12, 0, 127)] for c in channels]
-        symbols = stream(sections[number], tables)
-        latents = [(q << 12) + m for q, m in zip(symbols, means, strict=True)]
-        return rows(symbols, width), rows(latents, width)
+def decode(data: bytes, prefix: bool = False) -> dict[str, Any]:
+    """Everything that a file holds; rows of anchors are in canonical order.
 
-    whole = [[1]] * n
-    z_f = rows(stream(sections[7], hyper[:zf] * n), zf)
-    q_f, f = conditional(8, reference_network, [[v << 12 for v in z] for z in z_f], fd, whole)
-    q_c, c = conditional(9, covariance_network, f, 6, whole)
-    z_g = rows(stream(sections[10], hyper[zf:] * n), zg)
-    context = [[v << 12 for v in z] + row for z, row in zip(z_g, f, strict=True)]
-    q_g, g = conditional(11, residual_network, context, gd, mask)
-    by_slot = iter(q_g)
+    prefix: the file may end early; of the anchors, those of the ranges that are there.
+
+    Of each group: `symbols`, a row an anchor, with role 3 a row a slot of an anchor and zeros where nothing exists;
+    `latents` in Q12, a row an anchor, with role 3 a row a coupled primitive that exists.
+    """
+    file = read_file(data, prefix)
+    sections = file.sections
+    scene = read_scene(sections[SCENE])
+    ranges = [Fields(payload, NAMES[LATENTS]) for payload in file.latents]
+    heads = read_range_heads(ranges)
+    anchors = sum(head.anchors for head in heads) if prefix else scene.anchors
+    coupled = sum(head.coupled for head in heads) if prefix else scene.coupled
+    check_symbols(scene, anchors, len(data))
+    model = read_model(sections, scene, anchors, len(data))
+    tensors = read_heads(sections[HEADS], coupled, len(data), model.gaussian)
+    if GPCC in sections:
+        raise MissingDependency("positions (G-PCC): this decoder has no G-PCC")
+    positions = read_positions(sections[POSITIONS], scene.anchors)
+    mask = read_masks(sections[MASKS], scene.anchors, scene.coupled_primitives)
+    found = sum(map(sum, mask))
+    require(found == scene.coupled, "masks", f"{found} coupled primitives, expected {scene.coupled}")
+    check_ranges(heads, file.whole, positions, mask)
+    decoded = []
+    begin = 0
+    for fields, head in zip(ranges, heads, strict=True):
+        end = begin + head.anchors
+        places = [positions.context(i) for i in range(begin, end)]
+        decoded.append(read_range(fields, model, places, mask[begin:end]))
+        begin = end
+    require(not any(sections.get(PADDING, b"")), "padding", "a byte is not zero")
+    numbers = asdict(scene)
+    numbers.pop("groups")
     return {
-        "coordinates": [list(v) for v in coordinates],
-        "mask": mask,
-        "reference_hyper": z_f,
-        "reference": q_f,
-        "covariance": q_c,
-        "residual_hyper": z_g,
-        "residual": [[next(by_slot) if bit else [0] * gd for bit in row] for row in mask],
-        "reference_latents": f,
-        "covariance_latents": c,
-        "residual_latents": g,
+        "scene": numbers,
+        "coordinates": [list(v) for v in positions.coordinates[:begin]],
+        "mask": mask[:begin],
+        "groups": [
+            group_arrays(group, [parts[i] for parts in decoded], mask[:begin])
+            for i, group in enumerate(scene.groups)
+        ],
+        "heads": tensors,
+        "viewpoints": read_viewpoints(sections[VIEWPOINTS]) if VIEWPOINTS in sections else None,
+        "metadata": read_metadata(sections[METADATA]) if METADATA in sections else {},
     }
 
 
+def check_symbols(scene: Scene, anchors: int, n: int) -> None:
+    """n: length of the file."""
+    width = sum(group.width(scene.coupled_primitives) for group in scene.groups)
+    allowed = FREE_SYMBOLS + SYMBOLS_PER_BYTE * n
+    require(anchors * width <= allowed, "scene", f"{anchors * width} symbols, expected up to {allowed}")
+
+
+def read_model(sections: dict[int, bytes], scene: Scene, anchors: int, n: int) -> Model:
+    gaussian = gaussian_tables()
+    tables = read_tables(sections[TABLES], scene, gaussian)
+    networks = read_networks(sections[NETWORKS], scene, anchors, n, gaussian)
+    return Model(scene, tables, networks, gaussian)
+
+
+def group_arrays(group: Group, parts: list[Decoded], mask: list[list[int]]) -> dict[str, Any]:
+    symbols = [row for part in parts for row in part.symbols]
+    latents = [row for part in parts for row in part.latents]
+    if group.role == RESIDUAL:
+        existing = iter(symbols)
+        symbols = [[next(existing) if bit else [0] * group.channels for bit in row] for row in mask]
+    return asdict(group) | {"symbols": symbols, "latents": latents}
+
+
 if __name__ == "__main__":
-    print(json.dumps(decode(Path(sys.argv[1]).read_bytes())))
+    print(json.dumps(decode(Path(sys.argv[1]).read_bytes(), "--prefix" in sys.argv[2:])))

@@ -4,7 +4,7 @@
   not truncated and not left in floating point.
 - PSNR: of the mean squared error over pixels and channels, data range 255; identical images give infinity.
 - SSIM: 11 x 11 Gaussian window, sigma 1.5, zeros outside the image, data range 1, C1 = 0.01^2, C2 = 0.03^2,
-  mean over pixels and channels: the one of 3DGS (`compgs.ssim`).
+  mean over pixels and channels: the one of 3DGS (`compgs.numerics.ssim`).
 - LPIPS: network "vgg" as in 3DGS unless "alex" is asked for, version 0.1 through torchmetrics, inputs in
   [-1, 1]. The releases of 3DGS and CompGS feed [0, 1]: their figures are not comparable.
 
@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from compgs.errors import MissingDependency, install_line
-from compgs.ssim import l1_and_ssim
+from compgs.numerics.ssim import l1_and_ssim
 
 # Distance of two batches [1, 3, H, W] in [-1, 1].
 LpipsNetwork = Callable[[Tensor, Tensor], Tensor]

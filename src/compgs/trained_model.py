@@ -12,16 +12,62 @@ from torch import Tensor, nn
 from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.entropy.models import EntropyModel, Quantized, starting_residuals
-from compgs.entropy.quantization import quantize_weight
-from compgs.linear import Reader
+from compgs.model.constants import SHARED_RESIDUALS
+from compgs.model.heads import HeadDimensions, make_heads
 from compgs.model.hybrid_model import HybridModel
-from compgs.model.prediction import PredictionHeads
 from compgs.model.primitives import Primitives, every_slot
+from compgs.numerics.linear import Reader
+from compgs.stored_weights import StoredWeights
 
-# Biases are few: they keep more bits than the weights.
-BIAS_BITS = 14
-# Residual embeddings that all anchors share are few, too.
-SHARED_RESIDUAL_BITS = 10
+
+class OwnResiduals:
+    """Each anchor has its own K residual embeddings (Sec. 3.1): a row of the parameter for each anchor."""
+
+    anchor_parameters = ("residuals",)
+
+    def start(self, row: Tensor, anchors: int) -> Tensor:
+        """[N, K * residual_dim] of so many anchors, from the `row` [K * residual_dim] that a new anchor gets."""
+        return row.repeat(anchors, 1)
+
+    def of_anchors(self, residuals: Tensor, rows: Tensor | None, *, stored: bool) -> Tensor:
+        """[V, K * residual_dim] of the anchors in `rows` [V] int64 (None: of all), before they are quantized."""
+        return residuals if rows is None else residuals.index_select(0, rows)
+
+    def head_tensors(self, residuals: Tensor) -> dict[str, Tensor]:
+        """None of them is in the file's section of prediction heads: they are latents."""
+        return {}
+
+
+class SharedResiduals:
+    """All anchors share K residual embeddings: the parameter has one row, which the file holds beside the heads."""
+
+    anchor_parameters = ()
+
+    def __init__(
+        self, coupled_primitives: int, residual_dim: int, step: float, weights: StoredWeights
+    ) -> None:
+        self.shape = coupled_primitives, residual_dim
+        self.step = step
+        self.weights = weights
+
+    def start(self, row: Tensor, anchors: int) -> Tensor:
+        """[1, K * residual_dim]: the `row` [K * residual_dim] itself."""
+        return row.repeat(1, 1)
+
+    def of_anchors(self, residuals: Tensor, rows: Tensor | None, *, stored: bool) -> Tensor:
+        """[1, K * residual_dim] for whichever anchors; `stored`: as the file will hold them, straight-through."""
+        if not stored:
+            return residuals
+        rounded = self.weights.rounded(SHARED_RESIDUALS, self.dequantized(residuals))
+        return rounded.view_as(residuals) / self.step
+
+    def head_tensors(self, residuals: Tensor) -> dict[str, Tensor]:
+        """What they add to the file's section of prediction heads, by name, before it is rounded."""
+        return {SHARED_RESIDUALS: self.dequantized(residuals)}
+
+    def dequantized(self, residuals: Tensor) -> Tensor:
+        """[K, residual_dim] as prediction sees them, from the parameter [1, K * residual_dim], which is in steps."""
+        return (residuals * self.step).view(self.shape)
 
 
 class TrainedModel(nn.Module):
@@ -57,14 +103,21 @@ class TrainedModel(nn.Module):
         # Cameras of the world that stand for all that the scene was trained on, the first for them best; its sky.
         self.viewpoints: tuple[Camera, ...] = ()
         self.up: tuple[float, float, float] = (0.0, -1.0, 0.0)
-        self.heads = PredictionHeads(m.reference_dim, m.residual_dim, m.width, m.heads)
+        self.heads = make_heads(m.heads, HeadDimensions(m.reference_dim, m.residual_dim, m.width))
         self.entropy = EntropyModel(m, config.entropy)
         self.register_buffer("coordinates", coordinates.to(torch.int32))
         self.register_buffer("mask", torch.ones(n, m.coupled_primitives, dtype=torch.bool))
         self.log_scales = nn.Parameter(torch.zeros(n, 6))
         self.references = nn.Parameter(torch.zeros(n, m.reference_dim))
-        # Without residual embeddings of their own, all anchors have the one row that there is.
-        self.residuals = nn.Parameter(starting_residuals(self.entropy, m).repeat(n if m.residuals else 1, 1))
+        self.residual_kind: OwnResiduals | SharedResiduals = (
+            OwnResiduals()
+            if m.residuals
+            else SharedResiduals(
+                m.coupled_primitives, m.residual_dim, config.entropy.residual_step, self.weights
+            )
+        )
+        # [N, K * residual_dim] steps, or [1, K * residual_dim] where all anchors share them
+        self.residuals = nn.Parameter(self.residual_kind.start(starting_residuals(self.entropy, m), n))
 
     @property
     def anchors(self) -> int:
@@ -87,7 +140,7 @@ class TrainedModel(nn.Module):
     @property
     def anchor_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that have a row for each anchor."""
-        return ("log_scales", "references", *(("residuals",) if self.config.model.residuals else ()))
+        return ("log_scales", "references", *self.residual_kind.anchor_parameters)
 
     def readers(self) -> Iterator[Reader]:
         """The layers that take the references."""
@@ -96,8 +149,17 @@ class TrainedModel(nn.Module):
 
     def shared_residuals(self) -> Tensor:
         """[K, residual_dim] residual embeddings, where all anchors share them."""
-        m, e = self.config.model, self.config.entropy
-        return (self.residuals * e.residual_step).view(m.coupled_primitives, m.residual_dim)
+        assert isinstance(self.residual_kind, SharedResiduals)
+        return self.residual_kind.dequantized(self.residuals)
+
+    @property
+    def weights(self) -> StoredWeights:
+        """How exactly the file will hold the networks' weights."""
+        return StoredWeights.of(self.config.entropy)
+
+    def head_tensors(self) -> dict[str, Tensor]:
+        """What the file's section of prediction heads holds, by name, before it is rounded."""
+        return {**dict(self.heads.named_parameters()), **self.residual_kind.head_tensors(self.residuals)}
 
     def quantized(
         self,
@@ -117,23 +179,16 @@ class TrainedModel(nn.Module):
             return parameter if rows is None else parameter.index_select(0, rows)
 
         e = self.config.entropy
-        references, covariances = (
-            chosen(self.references),
-            chosen(self.log_scales) / self.entropy.covariance_step,
-        )
-        residuals: Tensor = self.residuals
-        if self.config.model.residuals:
-            residuals = chosen(residuals)
-        elif stored_weights:
-            stored = quantize_weight(self.shared_residuals(), SHARED_RESIDUAL_BITS)
-            residuals = stored.view_as(residuals) / e.residual_step
+        references = chosen(self.references)
+        covariances = chosen(self.log_scales) / self.entropy.covariance_step
+        residuals = self.residual_kind.of_anchors(self.residuals, rows, stored=stored_weights)
         latents = self.entropy(
             references,
             covariances,
             residuals,
             rate=rate,
             noise=noise,
-            network_bits=e.network_bits if stored_weights else None,
+            network_bits=self.weights.network if stored_weights else None,
             mask=chosen(self.mask) if masked else None,
         )
         if e.quantized:
@@ -155,11 +210,7 @@ class TrainedModel(nn.Module):
 
     def stored_head_weights(self) -> dict[str, Tensor]:
         """The heads' parameters as the file will hold them, by name, straight-through."""
-        bits = self.config.entropy.head_bits
-        return {
-            name: quantize_weight(p, bits if p.dim() > 1 else BIAS_BITS)
-            for name, p in self.heads.named_parameters()
-        }
+        return {name: self.weights.rounded(name, p) for name, p in self.heads.named_parameters()}
 
     @torch.no_grad()
     def as_hybrid_model(self, *, stored_weights: bool = True) -> HybridModel:

@@ -23,8 +23,10 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
     return code, captured.out, captured.err
 
 
-def test_the_eight_commands_are_there() -> None:
-    assert NAMES == ["train", "encode", "decode", "render", "evaluate", "export", "info", "demo-scene"]
+def test_the_nine_commands_are_there() -> None:
+    assert NAMES == [
+        "train", "encode", "decode", "render", "evaluate", "export", "serve", "info", "demo-scene",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
@@ -327,3 +329,17 @@ def test_thread_counts_that_are_not_there_are_refused(
     code, _, err = outcome(capsys, "decode", tmp_path / "a.cgs", "--threads", threads)
     assert code == 2
     assert "expected 1 to" in err
+
+
+def test_info_lists_the_beginnings_of_a_file_that_are_scenes(capsys: pytest.CaptureFixture[str]) -> None:
+    """Octree level, anchors, bytes: the last one is all of them, but for the metadata behind it."""
+    file = GOLDEN_FILE.with_name("odd.cgs")
+    code, out, _ = outcome(capsys, "info", file)
+    assert code == 0 and "format version 2" in out
+    lines = [line.split() for line in out.splitlines()]
+    ranges = lines[
+        lines.index(["octree", "level", "anchors", "up", "to", "there", "bytes", "of", "the", "file"]) + 1 :
+    ]
+    assert [(level, anchors) for level, anchors, _ in ranges] == [("0", "1"), ("4", "60"), ("7", "70")]
+    sizes = [int(size.replace(",", "")) for _, _, size in ranges]
+    assert sizes == sorted(sizes) and sizes[-1] < file.stat().st_size < sizes[-1] + 60

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from compgs.cli import console, progress
+from compgs.codec.reader import RangeInfo
 
 
 @pytest.mark.parametrize(
@@ -28,6 +29,13 @@ def test_components_are_shown_with_their_sum(capsys: pytest.CaptureFixture[str])
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == ["positions", "300", "30.0", "%", "24.00", "3.00"]
     assert lines[3].split() == ["total", "1,000", "100.0", "%", "80.00", "10.00"]
+
+
+def test_beginnings_of_a_file_are_shown_with_what_they_hold(capsys: pytest.CaptureFixture[str]) -> None:
+    console.print_ranges([RangeInfo(3, 59, 4118), RangeInfo(8, 12_800, 84_019)])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["3", "59", "4,118"]
+    assert lines[2].split() == ["8", "12,800", "84,019"]
 
 
 @dataclass(frozen=True)

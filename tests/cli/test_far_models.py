@@ -36,7 +36,7 @@ def test_decoded_arrays_say_where_they_count_from(tmp_path: Path, monkeypatch: p
     config = Config(model=ModelConfig(coupled_primitives=4, reference_dim=8, residuals=True, width=16))
     coordinates = torch.arange(15).view(5, 3)
     model = TrainedModel(config, coordinates, 0.05, 3.0, (0.0, 0.0, 0.0), offset).as_hybrid_model()
-    monkeypatch.setattr(compgs.codec, "decode", lambda path, device=None: model)
+    monkeypatch.setattr(compgs.codec, "decode", lambda path, device=None, prefix=None: model)
     Decode(file=file, output=tmp_path / "arrays").run()
     for name, positions in (("latents.npz", "positions"), ("geometry.npz", "means")):
         with np.load(tmp_path / "arrays" / name) as arrays:

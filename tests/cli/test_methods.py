@@ -46,8 +46,8 @@ def test_presets_steps_seed_and_settings_of_its_own_apply_to_3dgs() -> None:
         (["--method", "3dgs", "--set", "training.rate=bits"], r"training.rate: .* which has splats"),
         (["--set", "splats.harmonics=1"], r"splats.harmonics: not a setting of --method compgs, which has model"),
         (["--method", "3dgs", "--set", "splats.harmonics=4"], "0 to 3"),
-        (["--method", "3dgs", "--set", "splats.position_lr=0.1,-1"], "two learning rates"),
-        (["--method", "3dgs", "--set", "splats.reset_opacity=0.001"], "above prune_opacity"),
+        (["--method", "3dgs", "--set", "splats.position_lr=0.1,-1"], "expected 2 numbers, each above 0"),
+        (["--method", "3dgs", "--set", "splats.reset_opacity=0.001"], "expected more than splats.prune_opacity"),
         (["--method", "3dgs", "--set", "splat.harmonics=1"], "no section 'splat'"),
     ],
 )  # fmt: skip

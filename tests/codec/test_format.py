@@ -7,8 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from compgs.codec import fields, format, integer_network, rans, sections, tables, weights
+from compgs.codec import content, fields, format, integer_network, latents, rans, sections, tables, weights
 from compgs.codec.format import (
+    HEADS,
+    LATENTS,
+    MAX_RANGES,
+    METADATA,
     POSITIONS,
     POSITIONS_GPCC,
     REQUIRED,
@@ -16,6 +20,7 @@ from compgs.codec.format import (
     Section,
     container_bytes,
     pack,
+    section_ends,
     unpack,
 )
 from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile, TruncatedSection, UnsupportedVersion
@@ -63,15 +68,15 @@ def test_files_that_end_early_are_truncated(data: bytes) -> None:
 
 @pytest.mark.parametrize("data", [b"ply\nformat", b"\x93NUMPY", b"CGS1" * 100, bytes(64)])
 def test_other_files_are_not_compgs_files(data: bytes) -> None:
-    with pytest.raises(NotACompGSFile, match="93 43 47 53"):
+    with pytest.raises(NotACompGSFile, match=r"not a \.cgs file"):
         unpack(data)
 
 
 def test_truncation_names_the_section() -> None:
     data = some_file()
-    cut = data[: len(data) - 40]
+    cut = data[: len(data) - 3 * LATENTS - 5]
     with pytest.raises(
-        TruncatedSection, match="residual hyperprior: header promises 30 bytes, the file ends after"
+        TruncatedSection, match="prediction heads: header promises 21 bytes, the file ends after 16"
     ):
         unpack(cut)
 
@@ -79,7 +84,8 @@ def test_truncation_names_the_section() -> None:
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"version": 2}, UnsupportedVersion, "version 2.*newer compgs"),
+        ({"version": 3}, UnsupportedVersion, "version 3.*newer compgs"),
+        ({"version": 1}, UnsupportedVersion, "version 1.*encode the scene again"),
         ({"version": 0}, UnsupportedVersion, "version 0"),
         ({"flags": 1}, CorruptSection, "flags"),
         ({"flags": 128}, CorruptSection, "flags"),
@@ -87,7 +93,8 @@ def test_truncation_names_the_section() -> None:
         ({"x7": 2}, CorruptSection, "ascending"),
         ({"x16": 99}, UnsupportedVersion, "section 99 is unknown"),
         ({"x16": 1}, CorruptSection, "ascending"),
-        ({"x97": 0x83}, CorruptSection, "'residual embeddings' is missing"),
+        ({"x61": 0x84}, CorruptSection, "'latents' is missing"),
+        ({"x52": LATENTS}, CorruptSection, "'prediction heads' is missing"),
     ],
 )
 def test_absurd_headers_are_refused(
@@ -98,7 +105,7 @@ def test_absurd_headers_are_refused(
 
 
 def test_missing_and_left_over_parts_are_refused() -> None:
-    with pytest.raises(CorruptSection, match="'residual embeddings' is missing"):
+    with pytest.raises(CorruptSection, match="'latents' is missing"):
         unpack(pack([Section(n, b"") for n in PRESENT[:-1]]))
     with pytest.raises(CorruptSection, match="3 bytes are left over"):
         unpack(some_file() + b"abc")
@@ -119,14 +126,70 @@ def test_every_flipped_bit_is_caught() -> None:
 def test_flipped_payload_bits_name_their_section() -> None:
     data = bytearray(some_file())
     data[-1] ^= 1
-    with pytest.raises(CorruptSection, match="residual embeddings: its checksum"):
+    with pytest.raises(CorruptSection, match="latents: its checksum"):
         unpack(bytes(data))
+
+
+RANGES = [Section(LATENTS, b"coarse"), Section(LATENTS, b"finer"), Section(LATENTS, b"all")]
+
+
+def file_of_ranges() -> bytes:
+    """Latents in three sections, metadata between two of them."""
+    others = [Section(n, bytes([n]) * 5) for n in PRESENT if n != LATENTS]
+    return pack([*others, *RANGES[:2], Section(METADATA, b"who"), RANGES[2]])
+
+
+def test_only_latents_may_come_in_several_sections() -> None:
+    assert [s.data for s in unpack(file_of_ranges()) if s.number == LATENTS] == [s.data for s in RANGES]
+    for number in (*PRESENT, METADATA):
+        if number == LATENTS:
+            continue
+        twice = sorted([*PRESENT, number, METADATA])
+        with pytest.raises(CorruptSection, match="ascending order, each once"):
+            unpack(pack([Section(n, b"") for n in twice]))
+    many = [Section(n, b"") for n in PRESENT] + [Section(LATENTS, b"")] * MAX_RANGES
+    assert len(unpack(pack(many[:-1]))) == len(many) - 1
+    with pytest.raises(CorruptSection, match=f"{MAX_RANGES + 1} ranges, expected at most {MAX_RANGES}"):
+        unpack(pack(many))
+
+
+def test_a_beginning_of_a_file_has_the_sections_that_are_whole() -> None:
+    """At every length: with the first range whole it is accepted, and else refused by the name of what is missing."""
+    data = file_of_ranges()
+    whole = unpack(data)
+    ends = section_ends(data)
+    assert [number for number, _ in ends] == [section.number for section in whole]
+    assert ends[-1][1] == len(data)
+    first = next(end for number, end in ends if number == LATENTS)
+    for size in range(len(data) + 1):
+        present = sum(end <= size for _, end in ends)
+        if size >= first:
+            assert unpack(data[:size], prefix=True) == whole[:present]
+            continue
+        with pytest.raises(TruncatedSection) as refused:
+            unpack(data[:size], prefix=True)
+        if size >= container_bytes(data[6]):
+            assert str(refused.value).startswith(f"{whole[present].name}: of {size} bytes nothing can be")
+    for size in range(first, len(data)):
+        with pytest.raises(TruncatedSection):
+            unpack(data[:size])
+
+
+def test_a_beginning_is_not_taken_for_a_damaged_file() -> None:
+    """What is there must be right: a flipped bit of a whole section is found, and nothing may follow the last."""
+    data = bytearray(file_of_ranges())
+    at = dict(section_ends(bytes(data)))[HEADS] - 1
+    data[at] ^= 1
+    with pytest.raises(CorruptSection, match="prediction heads: its checksum"):
+        unpack(bytes(data[:-1]), prefix=True)
+    with pytest.raises(CorruptSection, match="left over"):
+        unpack(file_of_ranges() + b"x", prefix=True)
 
 
 def test_document_and_code_agree_on_the_constants() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     stated = dict(re.findall(r"^\| `([A-Z_0-9]+)` \| ([^|]+?) \|", text, re.MULTILINE))
-    modules = [format, fields, integer_network, rans, sections, tables, weights]
+    modules = [format, content, fields, integer_network, latents, rans, sections, tables, weights]
     assert len(stated) >= 30
     for name, value in stated.items():
         found = [getattr(m, name) for m in modules if hasattr(m, name)]

@@ -8,13 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from compgs.codec.format import SCENE, Section, pack, unpack
-from compgs.codec.reader import read_content
+from compgs.codec.fields import FieldReader, varint
+from compgs.codec.format import LATENTS, SCENE, Section, pack, unpack
+from compgs.codec.latents import read_head
+from compgs.codec.reader import read_content, read_latents
 from compgs.codec.sections import SCENE_LAYOUT
 from compgs.codec.writer import write_content
 from compgs.errors import BitstreamError, CorruptSection
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+import fuzz
 from fuzz import FORGERS, GOLDEN, forgeries, outcome
 from made_content import make_content
 
@@ -29,12 +32,29 @@ def golden() -> list[bytes]:
 
 def test_forgeries_are_refused_or_sound(golden: list[bytes]) -> None:
     seen = set()
-    for kind, data in islice(forgeries(golden, seed=1), 700):
+    for kind, data in islice(forgeries(golden, seed=1), 800):
         seen.add((kind, outcome(data)))
     assert {kind for kind, _ in seen} == {forger.__name__ for forger in FORGERS}
     assert {kind for kind, result in seen if result == "accepted"} <= {
-        "forged_payload", "forged_scene", "forged_header", "spliced", "flipped",
+        "forged_payload", "forged_scene", "forged_header", "spliced", "flipped", "forged_groups", "forged_range",
+        "forged_network",
     }  # fmt: skip
+
+
+def test_a_file_that_takes_longer_than_its_length_allows_is_a_failure(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, golden: list[bytes], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The clock is a made-up one: decoding takes 4 s and 0.3 ms a byte, the bound is 4 s and 0.2 ms."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(fuzz, "decoding_seconds", lambda data: 4.0 + 3e-4 * len(data))
+    monkeypatch.setattr(fuzz, "outcome", lambda data: "accepted")
+    monkeypatch.setattr(fuzz, "forgeries", lambda files, seed: iter([("some", golden[0]), ("some", b"")]))
+    monkeypatch.setattr(sys, "argv", ["fuzz.py"])
+    with pytest.raises(SystemExit, match="1"):
+        fuzz.main()
+    assert [path.name for path in tmp_path.iterdir()] == ["fuzz-0-0.cgs"]
+    assert (tmp_path / "fuzz-0-0.cgs").read_bytes() == golden[0]
+    assert "2 files, 1 failures" in capsys.readouterr().out
 
 
 def test_flipped_bits_are_always_caught(golden: list[bytes]) -> None:
@@ -48,17 +68,24 @@ def test_flipped_bits_are_always_caught(golden: list[bytes]) -> None:
 
 @pytest.mark.parametrize("anchors", [1 << 24, 200_000, 9_000])
 @pytest.mark.parametrize("coupled", [1, 10, 64])
-def test_memory_stays_proportional_to_the_file(anchors: int, coupled: int) -> None:
+@pytest.mark.parametrize("prefix", [False, True])
+def test_memory_stays_proportional_to_the_file(anchors: int, coupled: int, prefix: bool) -> None:
     sections = unpack(write_content(make_content(30, 1)))
-    fields = list(struct.unpack(SCENE_LAYOUT, sections[0].data))
+    size = struct.calcsize(SCENE_LAYOUT)
+    fields = list(struct.unpack(SCENE_LAYOUT, sections[0].data[:size]))
     fields[0], fields[1], fields[2] = anchors, anchors * coupled, coupled
     assert sections[0].number == SCENE
-    sections[0] = Section(SCENE, struct.pack(SCENE_LAYOUT, *fields))
+    sections[0] = Section(SCENE, struct.pack(SCENE_LAYOUT, *fields) + sections[0].data[size:])
+    at = next(i for i, section in enumerate(sections) if section.number == LATENTS)
+    reader = FieldReader(sections[at].data, "latents")
+    head = read_head(reader)
+    forged = bytes([head.level]) + varint(anchors) + varint(anchors * coupled)
+    sections[at] = Section(LATENTS, forged + sections[at].data[reader.position :])
     data = pack(sections)
     tracemalloc.start()
     try:
         with pytest.raises(CorruptSection):
-            read_content(data)
+            read_latents(data, prefix=prefix)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

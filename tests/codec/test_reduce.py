@@ -1,20 +1,22 @@
 """Reductions of a file: what stays decodes to what it was, what becomes coarser stays within half a step."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from compgs.codec.content import COVARIANCE_DIM, FileContent, dequantize
+from compgs.codec.content import FileContent, GroupShape, Role, dequantize
 from compgs.codec.integer_network import entropy_parameters
 from compgs.codec.reader import read_content
 from compgs.codec.reduce import rescaled, with_coarser_covariances, without_coupled
 from compgs.codec.writer import write_content
+from compgs.errors import NotEncodable
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
-from made_content import make_content
+from made_content import make_content, make_dimensions, paper_groups
 
 ONE = 1 << 12
 
@@ -37,9 +39,8 @@ def test_what_is_kept_decodes_to_what_it_was(content: FileContent) -> None:
     anchors = kept_anchors(content, kept)
     assert len(smaller.coordinates) == anchors.sum() <= len(content.coordinates) - 3
     before, after = dequantize(content), dequantize(smaller)
-    assert np.array_equal(after.reference, before.reference[anchors])
-    assert np.array_equal(after.covariance, before.covariance[anchors])
-    assert np.array_equal(after.residual, before.residual[kept])
+    for group, old, new in zip(content.groups, before, after, strict=True):
+        assert np.array_equal(new, old[kept if group.shape.role == Role.RESIDUAL else anchors])
     assert np.array_equal(smaller.coordinates, content.coordinates[anchors])
     written = write_content(smaller)  # the file may hold the remaining anchors in another order
     assert set(map(tuple, read_content(written).coordinates)) == set(map(tuple, smaller.coordinates))
@@ -53,36 +54,69 @@ def test_the_content_that_was_given_stays_as_it_was(content: FileContent) -> Non
     assert write_content(content) == before
 
 
+SIX_STEPS = (0.125, 0.15, 0.1, 0.2, 0.25, 0.175)
+
+
+@pytest.fixture(scope="module", params=["one step", "six steps", "blocks"])
+def any_content(request: pytest.FixtureRequest) -> FileContent:
+    groups = list(paper_groups())
+    if request.param == "six steps":
+        groups[2] = GroupShape(Role.LOG_SCALES, 6, SIX_STEPS, (1,))
+    blocks = 2 if request.param == "blocks" else 0
+    return read_content(
+        write_content(make_content(600, 4, make_dimensions(10, tuple(groups)), blocks=blocks))
+    )
+
+
 @pytest.mark.parametrize("ratio", [2.0, 3.0, 5.0])
 def test_coarser_covariances_stay_within_half_a_new_step_and_cost_less(
-    content: FileContent, ratio: float
+    any_content: FileContent, ratio: float
 ) -> None:
-    coarser = read_content(write_content(with_coarser_covariances(content, ratio)))
-    before, after = dequantize(content), dequantize(coarser)
-    assert coarser.covariance_step == pytest.approx(ratio * content.covariance_step)
-    values, new_values = (
-        x.covariance.astype(np.float64) * y.covariance_step / ONE
-        for x, y in ((before, content), (after, coarser))
-    )
-    assert np.abs(values - new_values).max() <= (0.5 + 1 / ONE) * coarser.covariance_step
-    assert np.array_equal(after.reference, before.reference)
-    assert np.array_equal(after.residual, before.residual)
-    assert len(write_content(coarser)) < len(write_content(content))
+    coarser = read_content(write_content(with_coarser_covariances(any_content, ratio)))
+    before, after = dequantize(any_content), dequantize(coarser)
+    steps, new_steps = (np.array(c.group(Role.LOG_SCALES).shape.steps) for c in (any_content, coarser))
+    assert new_steps == pytest.approx(ratio * steps)
+    values, new_values = before[2] * steps / ONE, after[2] * new_steps / ONE
+    assert (np.abs(values - new_values).max(0) <= (0.5 + 1 / ONE) * new_steps).all()
+    for i in (0, 1, 3, 4):
+        assert np.array_equal(after[i], before[i])
+    assert len(write_content(coarser)) < len(write_content(any_content))
 
 
-@pytest.mark.parametrize("hidden", [0, 12])
-def test_a_rescaled_network_predicts_the_same_distribution_in_the_new_unit(hidden: int) -> None:
-    content = make_content(200, 5, hidden=hidden)
-    context = dequantize(content).reference
-    network = content.networks["covariance"]
+@pytest.mark.parametrize("blocks", [0, 2])
+@pytest.mark.parametrize("ratios", [np.full(6, 2.0), np.array([1.0, 2.0, 4.0, 8.0, 2.0, 0.5])])
+def test_a_rescaled_network_predicts_the_same_distribution_in_the_new_unit(
+    blocks: int, ratios: np.ndarray
+) -> None:
+    content = make_content(200, 5, blocks=blocks, hidden=12)
+    context = dequantize(content)[1]
+    network = content.group(Role.LOG_SCALES).prior
     means, tables = entropy_parameters(network, context)
-    new_means, new_tables = entropy_parameters(rescaled(network, 2.0), context)
+    rescaled_network = rescaled(network, ratios)
+    assert rescaled_network.skip == network.skip
+    new_means, new_tables = entropy_parameters(rescaled_network, context)
     # Weights are rounded again: up to half a unit of the last place for each of the inputs.
-    assert np.abs(new_means / ONE - means / (2 * ONE)).max() < 0.05
-    inside = tables >= 12
-    assert inside.any()
-    assert np.array_equal(new_tables[inside], tables[inside] - 12)
-    assert new_means.shape == (200, COVARIANCE_DIM)
+    assert np.abs(new_means / ONE - means / (ratios * ONE)).max() < 0.05
+    lower = tables - 12 * np.log2(ratios)
+    inside = (lower >= 0) & (lower <= 127) & (tables > 0) & (tables < 127)
+    assert inside.any(0).all()
+    assert np.array_equal(new_tables[inside], lower[inside])
+    assert new_means.shape == (200, 6)
+
+
+def test_log_scales_that_others_are_conditioned_on_are_left_alone() -> None:
+    """So are several groups of them, and those with tables: there is no network to tell of the new unit."""
+    side, f = GroupShape(Role.SIDE, 2), GroupShape(Role.REFERENCE, 4, (1.0,), (0,))
+    c = GroupShape(Role.LOG_SCALES, 6, (0.5,), (1,))
+    half = replace(c, channels=3)
+    for groups in (
+        (side, f, c, GroupShape(Role.REFERENCE, 2, (1.0,), (2,))),
+        (side, f, half, half),
+        (side, f, replace(c, context=())),
+    ):
+        content = make_content(20, 1, make_dimensions(2, groups))
+        with pytest.raises(NotEncodable, match="log scales"):
+            with_coarser_covariances(content, 2.0)
 
 
 def test_reductions_go_one_after_the_other(content: FileContent) -> None:

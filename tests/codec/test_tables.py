@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from compgs.codec import tables as tables_module
 from compgs.codec.fields import FieldReader
-from compgs.codec.sections import decode_hyper_tables, encode_hyper_tables
+from compgs.codec.sections import decode_tables, encode_tables
 from compgs.codec.tables import (
     GAUSSIAN_COUNT,
     GAUSSIAN_CRC32,
@@ -96,7 +96,7 @@ def test_hyper_tables_come_back_from_their_section(rows: list[list[int]], data: 
     written = tuple(
         HyperTable(data.draw(st.integers(-(1 << 18), 1 << 18)), np.array(levels, np.uint8)) for levels in rows
     )
-    read = decode_hyper_tables(encode_hyper_tables(written), "hyperprior tables", len(written))
+    read = decode_tables(encode_tables(written), "hyperprior tables", len(written))
     assert [t.lowest for t in read] == [t.lowest for t in written]
     assert all((a.levels == b.levels).all() for a, b in zip(read, written, strict=True))
 
@@ -126,7 +126,7 @@ def test_hyper_tables_follow_the_learned_density_where_symbols_are_few() -> None
 @pytest.mark.parametrize("data", [b"", b"\x02\x00", b"\x01\x00\x00\x00\x00", b"\x82\x80\x00\x00"])
 def test_broken_hyper_tables_are_refused_by_name(data: bytes) -> None:
     with pytest.raises(CorruptSection, match="hyperprior tables"):
-        decode_hyper_tables(data, "hyperprior tables", 1)
+        decode_tables(data, "hyperprior tables", 1)
 
 
 def test_varints_have_one_spelling() -> None:

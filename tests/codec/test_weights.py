@@ -6,10 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from compgs.codec.fields import FieldReader
+from compgs.codec.fields import FieldReader, varint
 from compgs.codec.integer_network import IntegerLayer, IntegerNetwork
 from compgs.codec.weights import (
-    NETWORKS,
+    ADDS,
+    MAX_WEIGHTS,
+    RECTIFY,
+    RESERVED,
     QuantizedTensor,
     decode_arrays,
     decode_heads,
@@ -23,20 +26,24 @@ from compgs.errors import CorruptSection, NotEncodable
 INT32 = st.integers(-(1 << 31), (1 << 31) - 1)
 
 
-def network(rng: np.random.Generator, *sizes: int) -> IntegerNetwork:
+def network(rng: np.random.Generator, *sizes: int, skip: bool = False, adds: bool = False) -> IntegerNetwork:
+    """`adds`: wherever a layer may."""
     layers = []
+    last = len(sizes) - 2
     for i in range(len(sizes) - 1):
-        weight = rng.integers(-2048, 2048, (sizes[i + 1], sizes[i])).astype(np.int32)
+        taken = sizes[i] + (sizes[0] if skip and i == last else 0)
+        weight = rng.integers(-2048, 2048, (sizes[i + 1], taken)).astype(np.int32)
         bias = rng.integers(-(1 << 31) + 1, 1 << 31, sizes[i + 1])
-        layers.append(IntegerLayer(weight, bias, int(rng.integers(0, 31)), bool(rng.integers(2))))
-    return IntegerNetwork(tuple(layers))
+        branch = adds and 0 < i < last and sizes[i - 1] == sizes[i + 1]
+        layers.append(IntegerLayer(weight, bias, int(rng.integers(0, 31)), bool(rng.integers(2)), branch))
+    return IntegerNetwork(tuple(layers), skip)
 
 
 def same(a: IntegerNetwork, b: IntegerNetwork) -> bool:
-    return len(a.layers) == len(b.layers) and all(
+    return (len(a.layers), a.skip) == (len(b.layers), b.skip) and all(
         (x.weight == y.weight).all()
         and (x.bias == y.bias).all()
-        and (x.shift, x.rectify) == (y.shift, y.rectify)
+        and (x.shift, x.rectify, x.adds) == (y.shift, y.rectify, y.adds)
         and (x.weight.dtype, x.bias.dtype) == (y.weight.dtype, y.bias.dtype)
         for x, y in zip(a.layers, b.layers, strict=True)
     )
@@ -73,20 +80,108 @@ def test_gaussian_weights_take_their_entropy(spread: float) -> None:
     assert bits < max(continuous if spread > 1 else histogram, 0) * 1.01 + 160
 
 
-@given(st.integers(0, 1 << 30), st.lists(st.integers(1, 20), max_size=2))
-@settings(max_examples=25, deadline=None)
-def test_networks_come_back(seed: int, hidden: list[int]) -> None:
+@given(st.integers(0, 1 << 30), st.lists(st.integers(1, 4), max_size=7), st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_networks_come_back(seed: int, hidden: list[int], skip: bool) -> None:
     rng = np.random.default_rng(seed)
-    sizes = {"reference": (4, 10), "covariance": (5, 12), "residual": (9, 6)}
-    written = {name: network(rng, sizes[name][0], *hidden, sizes[name][1]) for name in NETWORKS}
+    sizes = [(4, 10), (5, 12), (9, 1)]
+    skip = skip and len(hidden) > 0
+    written = [network(rng, a, *hidden, b, skip=skip, adds=True) for a, b in sizes]
     data = encode_networks(written)
     read = decode_networks(data, "entropy networks", sizes)
-    assert all(same(written[name], read[name]) for name in NETWORKS)
+    assert all(same(a, b) for a, b in zip(written, read, strict=True))
+    assert encode_networks(read) == data
     with pytest.raises(CorruptSection, match="entropy networks"):
-        decode_networks(data, "entropy networks", sizes | {"covariance": (5, 14)})
+        decode_networks(data, "entropy networks", [sizes[0], (5, 14), sizes[2]])
     for size in range(0, len(data), 7):
         with pytest.raises(CorruptSection, match="entropy networks"):
             decode_networks(data[:size], "entropy networks", sizes)
+
+
+def test_no_networks_take_no_bytes() -> None:
+    assert encode_networks([]) == b""
+    assert decode_networks(b"", "entropy networks", []) == []
+    with pytest.raises(CorruptSection, match="left over"):
+        decode_networks(b"\0", "entropy networks", [])
+
+
+def network_bytes(*layers: tuple[int, int], flags: int = 0) -> bytes:
+    """The beginning of a network's section: (width, flags) of its layers."""
+    return bytes([len(layers), flags]) + b"".join(varint(width) + bytes([f]) for width, f in layers)
+
+
+@pytest.mark.parametrize(
+    ("data", "complaint"),
+    [
+        (network_bytes((4, 0), flags=1), "flags of network 0 are 1"),
+        (network_bytes((4, 0), (4, 0), flags=2), "flags of network 0 are 2"),
+        (network_bytes((4, 0), (4, 0), flags=0x80), "flags of network 0 are 128"),
+        (network_bytes((4, RESERVED)), "layer 0 of network 0: flags are 0x20"),
+        (network_bytes((3, RECTIFY), (4, RESERVED | 5)), "layer 1 of network 0: flags are 0x25"),
+        (network_bytes((4, 31)), "layer 0 of network 0: flags are 0x1f"),
+        (network_bytes((3, ADDS), (4, 0)), "layer 0 of network 0: its outputs cannot be added"),
+        (network_bytes((4, ADDS)), "layer 0 of network 0: its outputs cannot be added"),
+        (network_bytes((3, 0), (3, 0), (3, ADDS)), "layer 2 of network 0: its outputs cannot be added"),
+        (network_bytes((5, 0), (5, ADDS), (4, 0)), "layer 1 of network 0: its outputs cannot be added"),
+        (network_bytes((3, 0), (5, 0), (5, ADDS), (4, 0)), "layer 2 of network 0: its outputs cannot be"),
+        (network_bytes((0, 0)), "width of layer 0"),
+        (network_bytes(*[(4, 0)] * 9), "layers of network 0 is 9"),
+        (network_bytes((3, 0), (5, 0)), "network 0 has 5 outputs, expected 4"),
+        (network_bytes((1 << 16, 0), (1 << 16, 0), (4, 0)), "weights, the format holds at most"),
+    ],
+)
+def test_absurd_networks_are_refused_by_name(data: bytes, complaint: str) -> None:
+    with pytest.raises(CorruptSection, match=f"entropy networks.*{complaint}"):
+        decode_networks(data, "entropy networks", [(3, 4)])
+
+
+def test_networks_that_could_be_inexact_are_refused_when_they_are_read() -> None:
+    """What a file says is checked as what a program makes: 2 inputs of 2^28 leave 2^52."""
+    fields = network_bytes((2, 0))
+    heavy = np.full((1, 2), 1 << 28, np.int32)
+    arrays = [heavy, heavy, np.zeros(1, np.int32), np.zeros(1, np.int32)]
+    with pytest.raises(CorruptSection, match=r"entropy networks: layer 0: 2 inputs .* 2\^52"):
+        decode_networks(fields + encode_arrays(arrays), "entropy networks", [(2, 2)])
+
+
+def test_the_number_of_products_is_known_before_a_weight_is_decoded() -> None:
+    """Behind the fields there is nothing to decode: whoever tried would fail otherwise."""
+
+    class Refused(Exception):
+        pass
+
+    def refuse(products: int) -> None:
+        raise Refused(products)
+
+    fields = network_bytes((8, RECTIFY), (8, RECTIFY), (8, ADDS), (6, 0), flags=1) + network_bytes((4, 0))
+    with pytest.raises(Refused) as refused:
+        decode_networks(fields, "entropy networks", [(5, 6), (7, 4)], refuse)
+    assert refused.value.args == (5 * 8 + 8 * 8 + 8 * 8 + (8 + 5) * 6 + 7 * 4,)
+    named = b"\x02" + b"\x00\x01a\x02\x03\x05\x00" + b"\x01\x01b\x01\x04\x00"
+    with pytest.raises(Refused) as refused:
+        decode_heads(named, "prediction heads", refuse)
+    assert refused.value.args == (3 * 5 + 4,)
+
+
+def test_products_are_those_of_the_network_that_was_read() -> None:
+    counted: list[int] = []
+    written = [network(np.random.default_rng(0), 5, 8, 8, 8, 6, skip=True, adds=True)]
+    (read,) = decode_networks(encode_networks(written), "entropy networks", [(5, 6)], counted.append)
+    assert counted == [read.products] == [5 * 8 + 8 * 8 + 8 * 8 + 13 * 6]
+
+
+def test_networks_beyond_the_limits_are_refused_before_anything_is_written() -> None:
+    rng = np.random.default_rng(0)
+    many = IntegerNetwork(
+        (IntegerLayer(np.zeros((1 << 11, 1 << 11), np.int32), np.zeros(1 << 11, np.int64), 0, False),)
+    )
+    for written, complaint in [
+        ([network(rng, *[2] * 10)], "9 layers"),
+        ([network(rng, 1, (1 << 16) + 1)], "wider"),
+        ([many], f"weights, the format holds at most {MAX_WEIGHTS}"),
+    ]:
+        with pytest.raises(NotEncodable, match=complaint):
+            encode_networks(written)
 
 
 @given(

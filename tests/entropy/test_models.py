@@ -1,13 +1,17 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy import STREAMS, EntropyModel
+from compgs.entropy.models import starting_residuals
+from compgs.entropy.network import EntropyNetwork
 
 MODEL = ModelConfig(coupled_primitives=3, reference_dim=6, residuals=True, residual_dim=4)
-ENTROPY = EntropyConfig(reference_hyper_dim=2, residual_hyper_dim=3)
+ENTROPY = EntropyConfig(reference_hyper_dim=2)
+BLOCKS = EntropyConfig(reference_hyper_dim=2, network_blocks=2, network_width=7)
 
 
 def latents(n=50, seed=0):
@@ -15,10 +19,10 @@ def latents(n=50, seed=0):
     return [torch.randn(n, c, generator=g) * s for c, s in ((6, 3.0), (6, 20.0), (12, 2.0))]
 
 
-@pytest.fixture
-def entropy():
+@pytest.fixture(params=[ENTROPY, BLOCKS], ids=["linear", "blocks"])
+def entropy(request):
     torch.manual_seed(0)
-    return EntropyModel(MODEL, ENTROPY)
+    return EntropyModel(MODEL, request.param)
 
 
 def test_bits_are_given_per_anchor_for_every_stream(entropy):
@@ -95,3 +99,86 @@ def test_without_noise_training_sees_the_density_at_the_symbols_and_has_gradient
     torch.stack([b.sum() for b in bits.values()]).sum().backward()
     assert all(float(y.grad.abs().sum()) > 0 for y in latents)
     assert float(entropy.residual_density.logits.grad.abs().sum()) > 0
+
+
+def test_residuals_are_predicted_from_references_and_then_their_hyperprior(entropy):
+    """What the network is given, in the file's order; and one channel of the hyperprior for each primitive."""
+    f, c, g = latents()
+    seen = {}
+    entropy.residual_network.inputs_of_last, plain = (
+        lambda x, bits=None: seen.setdefault("x", x) is x and plain(x, bits),
+        entropy.residual_network.inputs_of_last,
+    )
+    references = entropy(f, c, g, rate=False).references
+    hyper = entropy.residual_analysis(g).round()
+    assert hyper.shape[1] == MODEL.coupled_primitives
+    torch.testing.assert_close(seen["x"], torch.cat([references, hyper], 1))
+
+
+def test_a_network_with_blocks_is_a_residual_perceptron_with_a_linear_skip():
+    """Written out: h = leaky(W0 x + b0), then h + W(leaky(W h + b)) + b twice, then W [h, x] + b."""
+    network = EntropyNetwork(4, 3, blocks=2, width=6, mean_gain=2.5).double()
+    with torch.no_grad():
+        for bias in network.biases:
+            bias.normal_()
+
+    def slow(x):
+        weights, biases = list(network.weights), list(network.biases)
+        h = torch.where((y := weights[0] @ x + biases[0]) > 0, y, y / 64)
+        for i in (1, 3):
+            y = weights[i] @ h + biases[i]
+            h = h + weights[i + 1] @ torch.where(y > 0, y, y / 64) + biases[i + 1]
+        y = weights[5] @ torch.cat([h, x]) + biases[5]
+        return y[:3] * 2.5, y[3:] * 12 + 60
+
+    x = torch.randn(20, 4, dtype=torch.float64)
+    mean, scale = network(x)
+    expected = [slow(row) for row in x]
+    torch.testing.assert_close(mean, torch.stack([m for m, _ in expected]))
+    torch.testing.assert_close(scale, torch.stack([s for _, s in expected]))
+
+
+def test_readers_of_the_references_are_all_the_weights_that_see_them(entropy):
+    """Other references that every reader undoes predict the same: a rotation, and its transpose in each of them."""
+    f = latents()[0]
+    turn = torch.linalg.qr(torch.randn(6, 6))[0]
+    z = torch.randn(50, 3)
+
+    def predicted(references):
+        return [
+            entropy.reference_analysis(references),
+            *entropy.covariance_network(references),
+            *entropy.residual_network(torch.cat([references, z], 1)),
+        ]
+
+    before = predicted(f)
+    with torch.no_grad():
+        for reader in entropy.readers():
+            part = reader.weight[:, reader.first : reader.first + 6]
+            part.copy_(part @ turn)
+    for old, new in zip(before, predicted(f @ turn), strict=True):
+        torch.testing.assert_close(new, old, atol=1e-3, rtol=1e-3)
+
+
+def test_anchors_that_share_residuals_pay_for_none_of_them():
+    torch.manual_seed(0)
+    model = replace(MODEL, residuals=False)
+    entropy = EntropyModel(model, ENTROPY)
+    assert entropy.residual_network is entropy.residual_analysis is entropy.residual_density is None
+    assert entropy.coded_networks == (entropy.reference_network, entropy.covariance_network)
+    f, c, _ = latents()
+    shared = starting_residuals(entropy, model)
+    assert shared.shape == (12,) and len(shared.unique()) == 12
+    result = entropy(f, c, shared[None], rate=True)
+    assert tuple(result.bits) == STREAMS[:3]
+    assert torch.equal(result.residuals, shared.expand(50, -1))
+
+
+def test_each_log_scale_has_a_step_of_its_own(entropy):
+    assert entropy.covariance_step.shape == (6,)
+    with torch.no_grad():
+        entropy.log_covariance_step.copy_(torch.linspace(-3, 0, 6))
+    torch.testing.assert_close(entropy.covariance_step, torch.linspace(-3, 0, 6).exp())
+    with torch.no_grad():
+        entropy.log_covariance_step.fill_(-30)
+    assert (entropy.covariance_step == 0.005).all()

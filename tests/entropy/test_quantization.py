@@ -47,3 +47,15 @@ def test_noise_is_uniform_over_one_step_and_repeats_with_its_seeds():
 def test_there_is_noise_for_any_number_of_latents():
     many = UniformNoise(0, np.random.default_rng(0))(torch.empty(3, UniformNoise.POOL // 2))
     assert abs(float(many.mean())) < 0.001 and many.std() > 0.28
+
+
+def test_noise_for_a_million_anchors_does_not_repeat_within_itself():
+    """A pool of 2^22 numbers, cut into pieces, came back after so many latents."""
+    noise = UniformNoise(0, np.random.default_rng(0))
+    many = noise(torch.empty(UniformNoise.POOL + 1_000_000)).numpy()
+    # Neighbours as one number each: in five million pairs of 24 random bits none comes twice.
+    bits = many.view(np.uint32).astype(np.uint64)
+    pairs = (bits[:-1] << np.uint64(32)) | bits[1:]
+    assert len(np.unique(pairs)) > len(pairs) - 3
+    again = UniformNoise(0, np.random.default_rng(0))(torch.empty(UniformNoise.POOL + 1_000_000)).numpy()
+    assert np.array_equal(many, again)

@@ -12,7 +12,7 @@ from compgs.formats.frames import (
     transformed,
     turned,
 )
-from compgs.rotations import rotation_from_quaternion
+from compgs.numerics.rotations import rotation_from_quaternion
 
 
 def covariances(arrays: SplatArrays) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from compgs.codec.content import Dimensions
+from compgs.codec.content import Role
 from compgs.codec.decoder import decode
 from compgs.codec.reader import read_latents
 from compgs.codec.writer import write_content
@@ -22,8 +22,7 @@ PINNED_FILE = GOLDEN / "gaussians.json"
 PINNED = json.loads(PINNED_FILE.read_text(encoding="utf-8")) if PINNED_FILE.exists() else {}
 sys.path += [str(ROOT / "tools"), str(ROOT / "benchmarks")]
 import make_golden_gaussians  # noqa: E402
-from made_content import make_content  # noqa: E402
-from made_heads import make_heads  # noqa: E402
+from made_content import make_content, make_dimensions, paper_groups  # noqa: E402
 from make_golden_gaussians import SHOWN, golden_gaussians, plain_content  # noqa: E402
 from plain_prediction import drawn, stacked, tolerances  # noqa: E402
 from prediction_precision import FIELDS, camera_at  # noqa: E402
@@ -53,8 +52,8 @@ def assert_predicted(path: Path, pinned: dict[str, Any]) -> None:
 
 @pytest.fixture
 def made_file(tmp_path: Path) -> Path:
-    d = Dimensions(4, 6, 3, 1, 2, "separate", 8)
-    content = replace(make_content(90, 4, d), heads=make_heads(np.random.default_rng(5), d))
+    d = make_dimensions(4, paper_groups(6, 3, 1, 2), "separate", 8)
+    content = make_content(90, 4, d)
     path = tmp_path / "made.cgs"
     path.write_bytes(write_content(content))
     return path
@@ -77,9 +76,9 @@ def test_what_is_pinned_of_a_file_is_what_its_model_predicts(made_file: Path, pi
 
 
 def test_a_gaussian_larger_than_float32_holds_is_neither_pinned_nor_rendered(tmp_path: Path) -> None:
-    d = Dimensions(4, 6, 3, 1, 2, "paired", 8)
-    content = replace(make_content(90, 4, d), heads=make_heads(np.random.default_rng(5), d))
-    content.covariance[3, 5] = 3000  # a size of exp(187) voxels
+    d = make_dimensions(4, paper_groups(6, 3, 1, 2), "paired", 8)
+    content = make_content(90, 4, d)
+    content.group(Role.LOG_SCALES).symbols[3, 5] = 3000  # a size of exp(187) voxels
     assert content.mask[3].any()
     path = tmp_path / "made.cgs"
     path.write_bytes(write_content(content))

@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from compgs.cameras import Camera
-from compgs.model import HybridModel, PredictionHeads, Primitives, hybrid_model, predict
+from compgs.model import (
+    HeadDimensions,
+    HybridModel,
+    Primitives,
+    hybrid_model,
+    inference,
+    make_heads,
+    predict,
+)
 from compgs.model.primitives import select_anchors
 
 N, D, G = 40, 12, 8
@@ -28,7 +36,14 @@ def make_model(
         anchor_index=torch.repeat_interleave(counts),
         voxel_size=0.05,
     )
-    return HybridModel(primitives, PredictionHeads(D, G, 16, layout), 4.0, (0.0, 0.0, 0.0))
+    return HybridModel(primitives, make_heads(layout, HeadDimensions(D, G, 16)), 4.0, (0.0, 0.0, 0.0))
+
+
+def in_precision(model: HybridModel, dtype: torch.dtype) -> HybridModel:
+    p = model.primitives
+    names = ("positions", "log_scales", "references", "residuals")
+    primitives = replace(p, **{name: getattr(p, name).to(dtype) for name in names})
+    return replace(model, primitives=primitives, heads=model.heads.to(dtype))
 
 
 @pytest.fixture
@@ -40,9 +55,11 @@ def counts() -> torch.Tensor:
 
 @pytest.mark.parametrize("layout", ["paired", "separate"])
 @pytest.mark.parametrize("block", [1, 7, 8, 1 << 14])
-def test_every_block_size_gives_the_gaussians_of_prediction(monkeypatch, counts, layout, block):
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["by kernels", "by torch"])
+def test_every_block_size_gives_the_gaussians_of_prediction(monkeypatch, counts, layout, block, dtype):
     monkeypatch.setattr(hybrid_model, "BLOCK", block)
-    model = make_model(layout, counts)
+    monkeypatch.setattr(inference, "BLOCK", block)
+    model = in_precision(make_model(layout, counts), dtype)
     visible = torch.rand(N, generator=torch.Generator().manual_seed(5)) < 0.6
     everything = torch.ones(N, dtype=torch.bool)
     for mask, found in (
@@ -51,7 +68,7 @@ def test_every_block_size_gives_the_gaussians_of_prediction(monkeypatch, counts,
         (everything, model.gaussians(CAMERA)),
     ):
         chosen = select_anchors(model.primitives, mask)
-        expected = predict(model.heads, chosen, torch.zeros(3), 4.0).gaussians
+        expected = predict(model.heads, chosen, torch.zeros(3, dtype=dtype), 4.0).gaussians
         assert len(found.means) > 5
         for name in FIELDS:
             torch.testing.assert_close(getattr(found, name), getattr(expected, name), atol=1e-5, rtol=1e-4)
@@ -87,3 +104,16 @@ def test_anchors_out_of_view_change_nothing(counts):
     for name in ("opacities", "colors", "means"):
         a, b = (getattr(m.gaussians(CAMERA, visible), name) for m in (model, other))
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["by kernels", "by torch"])
+def test_what_is_drawn_is_named_by_its_row_among_all_primitives(monkeypatch, counts, layout, dtype):
+    monkeypatch.setattr(hybrid_model, "BLOCK", 7)
+    model = in_precision(make_model(layout, counts), dtype)
+    visible = torch.arange(N) % 3 > 0
+    found, index = model.drawn(CAMERA, visible)
+    everything = predict(model.heads, model.primitives, torch.zeros(3, dtype=dtype), 4.0)
+    seen = everything.index[visible[model.primitives.anchor_index[everything.index]]]
+    assert torch.equal(index, seen) and 5 < len(index) < len(everything.index)
+    torch.testing.assert_close(found.means, model.geometry[0][index])

@@ -6,7 +6,16 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.losses import scale_regularizer
-from compgs.model import HybridModel, PredictionHeads, Primitives, hybrid_model, predict
+from compgs.model import (
+    HeadDimensions,
+    HybridModel,
+    PredictionHeads,
+    Primitives,
+    hybrid_model,
+    make_heads,
+    predict,
+)
+from compgs.model.constants import OPACITY_CUTOFF
 from compgs.model.primitives import every_slot
 from compgs.render import rasterize
 
@@ -17,7 +26,7 @@ CAMERA = Camera(np.eye(4), 30, 30, 16, 12, 32, 24)
 def make(layout: str, dtype: torch.dtype) -> tuple[PredictionHeads, Primitives]:
     g = torch.Generator().manual_seed(1)
     torch.manual_seed(0)
-    heads = PredictionHeads(D, G, 16, layout).to(dtype)
+    heads = make_heads(layout, HeadDimensions(D, G, 16)).to(dtype)
     positions, log_scales, references, residuals = (
         torch.randn(shape, generator=g).to(dtype) for shape in ((N, 3), (N, 6), (N, D), (N * K, G))
     )
@@ -54,7 +63,7 @@ def test_a_decoded_scene_looks_the_same_where_nothing_is_left_out(monkeypatch, l
     model = HybridModel(p, heads.requires_grad_(False), 4.0, (0.0, 0.0, 0.0))
     chosen = model.gaussians(CAMERA)
     monkeypatch.setattr(hybrid_model, "choosing_pays", lambda device: False)
-    monkeypatch.setattr(HybridModel, "_fused", property(lambda self: False))
+    monkeypatch.setattr(HybridModel, "_in_kernels", property(lambda self: False))
     everything = model.gaussians(CAMERA)
     assert len(everything) == N * K > len(chosen)
     with torch.no_grad():
@@ -89,3 +98,13 @@ def test_masked_prediction_reads_no_value_back(layout):
     center = torch.zeros(3, device="meta")
     found = predict(heads, Primitives(*moved, 0.1), center, 4.0, compact=False)
     assert found.gaussians.means.shape == (N * K, 3)
+
+
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+def test_what_is_not_drawn_has_an_opacity_of_exactly_0(layout):
+    heads, p = make(layout, torch.float64)
+    everything = predict(heads, p, torch.zeros(3, dtype=torch.float64), 4.0, compact=False)
+    drawn = everything.opacities > OPACITY_CUTOFF
+    assert torch.equal(everything.drawn, drawn) and 0 < drawn.sum() < N * K
+    assert (everything.gaussians.opacities[~drawn] == 0).all()
+    assert torch.equal(everything.gaussians.opacities[drawn], everything.opacities[drawn])

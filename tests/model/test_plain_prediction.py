@@ -13,12 +13,13 @@ from compgs.codec.decoder import decode
 from compgs.codec.reader import read_latents
 from compgs.codec.writer import write_content
 from compgs.gaussians import Gaussians
-from compgs.model import HybridModel, PredictionHeads, Primitives, predict
-from compgs.model.prediction import OPACITY_CUTOFF
+from compgs.model import HeadDimensions, HybridModel, Primitives, predict
+from compgs.model.constants import OPACITY_CUTOFF
+from compgs.model.heads import make_heads as new_heads
 
 ROOT = Path(__file__).parents[2]
 sys.path += [str(ROOT / "tools"), str(ROOT / "benchmarks")]
-from made_content import make_content  # noqa: E402
+from made_content import make_content, make_dimensions, paper_groups  # noqa: E402
 from made_heads import head_shapes, make_heads  # noqa: E402
 from make_golden_gaussians import plain_content  # noqa: E402
 from plain_prediction import (  # noqa: E402
@@ -34,19 +35,26 @@ from plain_prediction import (  # noqa: E402
 from prediction_precision import FIELDS, camera_at  # noqa: E402
 
 CENTER = (0.5, -1.25, 2.0)
-DIMENSIONS = {
-    "paired": Dimensions(4, 6, 3, 1, 2, "paired", 8),
-    "separate": Dimensions(4, 6, 3, 1, 2, "separate", 8),
-    "one slot": Dimensions(1, 1, 1, 1, 1, "paired", 1),
-    "wide": Dimensions(2, 40, 16, 2, 2, "separate", 96),
+# (K, channels of references and residuals, layout, width)
+SIZES = {
+    "paired": (4, 6, 3, "paired", 8),
+    "separate": (4, 6, 3, "separate", 8),
+    "one slot": (1, 1, 1, "paired", 1),
+    "wide": (2, 40, 16, "separate", 96),
 }
+
+
+def dimensions(name: str, *, own_residuals: bool) -> Dimensions:
+    k, reference, residual, layout, width = SIZES[name]
+    groups = paper_groups(reference, residual * own_residuals, 1, 2)
+    return make_dimensions(k, groups, layout, width, residual)
 
 
 def made(name: str, *, own_residuals: bool, anchors: int = 60) -> Content:
     """Made-up content; some anchors have no coupled primitive at all."""
-    d = DIMENSIONS[name]
+    d = dimensions(name, own_residuals=own_residuals)
     content, latents = read_latents(write_content(make_content(anchors, 5, d, kept=0.4)))
-    heads = make_heads(np.random.default_rng(6), d, own_residuals=own_residuals)
+    heads = make_heads(np.random.default_rng(10), d)
     assert not content.mask.any(1).all()
     return plain_content(replace(content, heads=heads), latents)
 
@@ -61,12 +69,8 @@ def model_of(content: Content) -> HybridModel:
             torch.arange(k).repeat(n)[torch.from_numpy(content.mask).view(-1)]
         ]
     network = "appearance" if content.layout == "paired" else "opacity"
-    heads = PredictionHeads(
-        content.references.shape[1],
-        residuals.shape[1],
-        len(tensors[f"{network}.input_bias"]),
-        content.layout,
-    )
+    width = len(tensors[f"{network}.input_bias"])
+    heads = new_heads(content.layout, HeadDimensions(content.references.shape[1], residuals.shape[1], width))
     heads.load_state_dict(tensors)
     primitives = Primitives(
         positions=torch.from_numpy(content.coordinates * content.voxel_size).float(),
@@ -93,7 +97,7 @@ def assert_conforms(gaussians: Gaussians, truth: Arrays) -> None:
 
 
 @pytest.mark.parametrize("own_residuals", [True, False], ids=["own residuals", "shared residuals"])
-@pytest.mark.parametrize("name", DIMENSIONS)
+@pytest.mark.parametrize("name", SIZES)
 def test_a_model_predicts_what_the_document_says(name: str, own_residuals: bool) -> None:
     content = made(name, own_residuals=own_residuals)
     everything = list(primitives(content, CENTER))
@@ -113,9 +117,9 @@ def test_a_model_predicts_what_the_document_says(name: str, own_residuals: bool)
 
 @pytest.mark.parametrize("name", ["paired", "separate"])
 def test_a_decoded_file_predicts_what_the_document_says(tmp_path: Path, name: str) -> None:
-    d = DIMENSIONS[name]
+    d = dimensions(name, own_residuals=True)
     made = replace(make_content(80, 7, d, kept=0.5), heads=make_heads(np.random.default_rng(8), d))
-    made = replace(made, reference_step=0.5, residual_step=0.25, voxel_size=0.375, view_distance_scale=7.0)
+    made = replace(made, voxel_size=0.375, view_distance_scale=7.0)
     path = tmp_path / "made.cgs"
     path.write_bytes(write_content(made))
     content = plain_content(*read_latents(path.read_bytes()))
@@ -145,11 +149,13 @@ def test_a_world_offset_moves_the_camera_and_nothing_else() -> None:
 
 @pytest.mark.parametrize("layout", ["paired", "separate"])
 def test_made_up_heads_have_the_tensors_of_the_package(layout: str) -> None:
-    d = Dimensions(3, 5, 4, 1, 1, layout, 7)
-    expected = {name: tuple(p.shape) for name, p in PredictionHeads(5, 4, 7, layout).named_parameters()}
+    d = make_dimensions(3, paper_groups(5, 4, 1, 1), layout, 7)
+    expected = {
+        name: tuple(p.shape) for name, p in new_heads(layout, HeadDimensions(5, 4, 7)).named_parameters()
+    }
     heads = make_heads(np.random.default_rng(1), d)
     assert {name: tensor.values.shape for name, tensor in heads} == head_shapes(d) == expected
-    shared = head_shapes(d, own_residuals=False)
+    shared = head_shapes(make_dimensions(3, paper_groups(5, 0, 1), layout, 7, 4))
     assert shared == expected | {"residuals": (3, 4)}
 
 

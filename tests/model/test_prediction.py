@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from compgs.cameras import Camera
-from compgs.model import HybridModel, PredictionHeads, Primitives, predict
-from compgs.model.prediction import OPACITY_CUTOFF, affine_transform, view_embedding
+from compgs.model import HeadDimensions, HybridModel, Primitives, make_heads, predict
+from compgs.model.constants import OPACITY_CUTOFF
+from compgs.model.prediction import affine_transform, view_embedding
 from compgs.model.primitives import every_slot, select_anchors
 
 N, K, D, G = 40, 5, 12, 8
@@ -34,7 +35,7 @@ def primitives():
 
 def heads(layout):
     torch.manual_seed(0)
-    return PredictionHeads(D, G, 16, layout)
+    return make_heads(layout, HeadDimensions(D, G, 16))
 
 
 CENTER = torch.tensor([0.3, -2.0, 5.0])
@@ -88,11 +89,18 @@ def test_primitives_below_the_cutoff_are_not_drawn(primitives):
     assert (result.index.diff() > 0).all()
 
 
-def test_stored_weights_replace_the_heads_own(primitives):
-    net = heads("paired")
-    zero = {name: torch.zeros_like(p) for name, p in net.named_parameters()}
-    assert len(predict(net, primitives, CENTER, 4.0, zero).index) == 0
-    assert len(predict(net, primitives, CENTER, 4.0).index) > 0
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("compact", [True, False])
+def test_stored_weights_replace_the_heads_own(primitives, layout, compact):
+    net = heads(layout)
+    other = make_heads(layout, HeadDimensions(D, G, 16))
+    stored = dict(other.named_parameters())
+    found = predict(net, primitives, CENTER, 4.0, stored, compact=compact)
+    expected = predict(other, primitives, CENTER, 4.0, compact=compact)
+    for name in ("means", "quaternions", "scales", "opacities", "colors"):
+        assert torch.equal(getattr(found.gaussians, name), getattr(expected.gaussians, name))
+    own = predict(net, primitives, CENTER, 4.0, compact=compact)
+    assert not torch.equal(own.opacities, found.opacities)
 
 
 @pytest.mark.parametrize("layout", ["paired", "separate"])

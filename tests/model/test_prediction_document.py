@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from compgs.cameras import Camera
-from compgs.model import HybridModel, PredictionHeads, Primitives
+from compgs.model import HeadDimensions, HybridModel, Primitives, make_heads
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "docs" / "bitstream_prediction.md").read_text(encoding="utf-8")
@@ -67,7 +67,7 @@ def test_the_document_names_the_networks_of_both_layouts() -> None:
                 full = f"{network}.{name}".replace(".b.", f".{b}.")
                 found[layout][full] = tuple(sizes[side] for side in shape.split(", "))
     for layout, tensors in found.items():
-        heads = PredictionHeads(d, g, h, layout)
+        heads = make_heads(layout, HeadDimensions(d, g, h))
         assert tensors == {name: tuple(p.shape) for name, p in heads.named_parameters()}
 
 
@@ -88,7 +88,7 @@ def test_every_number_of_the_worked_example_is_right() -> None:
 
 
 def test_the_worked_example_is_what_the_package_predicts() -> None:
-    heads = PredictionHeads(2, 1, 2, "paired").requires_grad_(False)
+    heads = make_heads("paired", HeadDimensions(2, 1, 2)).requires_grad_(False)
     heads.load_state_dict({k: torch.from_numpy(t).float() for k, t in TENSORS.items() if k != "residuals"})
 
     def row(name: str) -> torch.Tensor:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from compgs.rotations import quaternion_from_rotation
+from compgs.numerics.rotations import quaternion_from_rotation
 from compgs.scene.colmap import ColmapCamera, ColmapImage, ColmapPoints
 from compgs.scene.colmap_writer import write_sparse_model
 

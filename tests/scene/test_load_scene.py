@@ -11,7 +11,7 @@ from PIL import Image
 
 from compgs.cameras import Camera
 from compgs.errors import ConfigError
-from compgs.rotations import rotation_from_quaternion
+from compgs.numerics.rotations import rotation_from_quaternion
 from compgs.scene import View, load_scene
 from compgs.scene.colmap import ColmapCamera, read_sparse_model
 from compgs.scene.colmap_writer import write_sparse_model

@@ -6,7 +6,7 @@ from hypothesis.extra.numpy import arrays
 
 from compgs.cameras import Camera
 from compgs.errors import ConfigError
-from compgs.rotations import rigid
+from compgs.numerics.rotations import rigid
 from compgs.scene import Points
 from compgs.scene.points import COORDINATE_BITS, fallback_points, median_spacing, voxel_grid
 

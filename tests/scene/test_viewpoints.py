@@ -5,7 +5,7 @@ import pytest
 
 from compgs.cameras import Camera
 from compgs.errors import ConfigError
-from compgs.rotations import rigid
+from compgs.numerics.rotations import rigid
 from compgs.scene.viewpoints import choose_viewpoints, up_direction
 
 

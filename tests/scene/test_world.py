@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from compgs.cameras import Camera
-from compgs.rotations import rotation_from_quaternion
+from compgs.numerics.rotations import rotation_from_quaternion
 from compgs.scene import Points, Scene, View, load_scene
 from compgs.scene.colmap import read_sparse_model
 from compgs.scene.colmap_writer import write_sparse_model

@@ -10,7 +10,7 @@ from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig, lo
 from compgs.gaussians import Gaussians
 from compgs.model.prediction import Prediction
 from compgs.trained_model import TrainedModel
-from compgs.training import trainer as trainer_module
+from compgs.training import target_size
 from compgs.training.control import AdaptiveControl, ControlSchedule, make_schedule, new_cells, rate_weight
 from compgs.training.initial import initial_model
 from compgs.training.optimizers import make_optimizer
@@ -202,11 +202,11 @@ def test_a_size_is_followed_gently_before_statistics_are_gathered(blob_scene, ti
     """Anchors are still to come then: `grown` is false."""
     config = replace(tiny_config, training=replace(tiny_config.training, target_bytes=10**6, rate_start=0.0))
     trainer = Trainer(blob_scene, config, CPU)
-    trainer.schedule = ControlSchedule(start=20, stop=30, every=8, observe=15)
+    trainer.target_size.schedule = ControlSchedule(start=20, stop=30, every=8, observe=15)
     asked = []
-    monkeypatch.setattr(trainer_module, "follow", lambda state, *_, grown, **__: asked.append(grown) or state)
-    for trainer.step in (10, 20, 29, 30):
-        trainer.control_rate()
+    monkeypatch.setattr(target_size, "follow", lambda state, *_, grown, **__: asked.append(grown) or state)
+    for step in (10, 20, 29, 30):
+        trainer.target_size.follow(trainer.rate, step)
     assert asked == [False, False, False, True]
 
 

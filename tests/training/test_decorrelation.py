@@ -73,12 +73,12 @@ def test_what_the_entropy_model_expects_turns_with_the_references(
 
     def expected() -> tuple[torch.Tensor, ...]:
         z = entropy.reference_analysis(model.references)
-        hyper = torch.ones(model.anchors, trainer.config.entropy.residual_hyper_dim)
+        hyper = torch.ones(model.anchors, trainer.config.model.coupled_primitives)
         return (
             entropy.reference_network(z)[0],
             z,
             *entropy.covariance_network(model.references),
-            *entropy.residual_network(torch.cat([hyper, model.references], 1)),
+            *entropy.residual_network(torch.cat([model.references, hyper], 1)),
         )
 
     with torch.no_grad():

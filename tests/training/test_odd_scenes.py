@@ -298,7 +298,7 @@ def test_a_voxel_size_that_gives_too_many_anchors_is_refused(config: Config) -> 
 @pytest.mark.parametrize("value", [0, 255], ids=["black", "white"])
 def test_photographs_that_show_nothing_are_no_trouble(config: Config, tmp_path: Path, value: int) -> None:
     scene = portrait()
-    views = tuple(replace(v, image=np.full_like(v.image, value)) for v in scene.train_views)
+    views = tuple(replace(v, pixels=np.full_like(v.image, value)) for v in scene.train_views)
     encode(trained(replace(scene, train_views=views), config), tmp_path / "odd.cgs")
     decoded = decode(tmp_path / "odd.cgs")
     for view in views[:3]:

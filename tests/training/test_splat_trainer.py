@@ -158,7 +158,8 @@ def test_one_object_on_white_does_not_vanish(blob_scene):
     )  # fmt: skip
     white = RasterSettings(background=(1.0, 1.0, 1.0))
     views = tuple(
-        replace(v, image=to_8bit(rasterize(gaussians, v.camera, white).image)) for v in blob_scene.train_views
+        replace(v, pixels=to_8bit(rasterize(gaussians, v.camera, white).image))
+        for v in blob_scene.train_views
     )
     scene = replace(blob_scene, train_views=views, background=(1.0, 1.0, 1.0))
     model = train_splats(scene, Config(training=TrainingConfig(steps=300)))

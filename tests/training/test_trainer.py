@@ -10,7 +10,8 @@ from compgs.metrics import psnr, to_8bit
 from compgs.render import RasterSettings, rasterize, render
 from compgs.scene.views import View
 from compgs.training import train
-from compgs.training.trainer import Trainer, worth_keeping
+from compgs.training.importance import worth_keeping
+from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
 
@@ -32,20 +33,22 @@ def test_training_lowers_the_loss(blob_scene, tiny_config):
 
 
 @pytest.mark.parametrize(
-    ("layout", "normalization", "residuals"),
+    ("layout", "normalization", "residuals", "blocks"),
     [
-        ("paired", "bits", True),
-        ("paired", "bits", False),
-        ("separate", "elements", True),
-        ("separate", "bits", True),
+        ("paired", "bits", True, 0),
+        ("paired", "bits", False, 0),
+        ("paired", "bits", False, 1),
+        ("separate", "elements", True, 2),
+        ("separate", "bits", True, 0),
     ],
 )
 def test_every_layout_and_rate_trains_all_parameters(
-    blob_scene, tiny_config, layout, normalization, residuals
+    blob_scene, tiny_config, layout, normalization, residuals, blocks
 ):
     config = replace(
         tiny_config,
         model=replace(tiny_config.model, heads=layout, residuals=residuals),
+        entropy=replace(tiny_config.entropy, network_blocks=blocks, network_width=8),
         training=replace(tiny_config.training, steps=20, rate=normalization),
     )
     trainer = Trainer(blob_scene, config, CPU)
@@ -59,8 +62,7 @@ def test_every_layout_and_rate_trains_all_parameters(
         for name, p in trainer.model.named_parameters()
         if p.shape == before[name].shape and torch.equal(p, before[name])
     ]
-    # Residuals that all anchors share are nothing to code.
-    assert [name for name in still if residuals or not name.startswith("entropy.residual_")] == []
+    assert still == []
 
 
 def test_a_higher_lambda_spends_fewer_bits(blob_scene, tiny_config):
@@ -91,7 +93,7 @@ def test_one_object_on_white_does_not_vanish(blob_scene, tiny_config):
     white = RasterSettings(background=(1.0, 1.0, 1.0))
     views = tuple(
         replace(
-            v, image=(rasterize(gaussians, v.camera, white).image.clamp(0, 1) * 255).to(torch.uint8).numpy()
+            v, pixels=(rasterize(gaussians, v.camera, white).image.clamp(0, 1) * 255).to(torch.uint8).numpy()
         )
         for v in blob_scene.train_views
     )
@@ -151,7 +153,7 @@ def test_without_a_rate_term_only_the_statistics_learn_from_the_rate(blob_scene,
 def test_without_residual_embeddings_all_anchors_have_the_same_and_the_file_has_none(
     blob_scene, tiny_config, tmp_path
 ):
-    from compgs.codec import encode
+    from compgs.codec import decode, encode
     from compgs.codec.reader import file_info
 
     config = replace(
@@ -160,14 +162,21 @@ def test_without_residual_embeddings_all_anchors_have_the_same_and_the_file_has_
         training=replace(tiny_config.training, steps=60),
     )
     trainer = Trainer(blob_scene, config, CPU)
-    start = trainer.model.residuals[0].detach().clone()
+    start = trainer.model.shared_residuals().detach().clone()
     trainer.run(None, None)
-    residuals = trainer.model.residuals.detach()
-    assert torch.equal(residuals, residuals[:1].expand_as(residuals))
-    assert not torch.equal(residuals[0], start), "they learn"
+    shared = trainer.model.shared_residuals().detach()
+    assert shared.shape == (config.model.coupled_primitives, config.model.residual_dim)
+    assert not torch.equal(shared, start), "they learn"
+    assert trainer.model.entropy.residual_network is None
     encode(trainer.model, tmp_path / "a.cgs")
-    sections = {s.name: s.bytes for s in file_info((tmp_path / "a.cgs").read_bytes()).sections}
-    assert sections["residual embeddings"] < 60 and sections["residual hyperprior"] < 60
+    names = [s.name for s in file_info((tmp_path / "a.cgs").read_bytes()).sections]
+    assert not [name for name in names if name.startswith("residual")]
+    # Each coupled primitive has the row of its slot: those of an anchor that are left keep their order.
+    slots = torch.nonzero(trainer.model.mask[trainer.model.mask.any(1)])[:, 1]
+    decoded = decode(tmp_path / "a.cgs").primitives.residuals
+    assert len(decoded) == len(slots)
+    assert decoded.unique(dim=0).shape[0] == len(slots.unique())
+    assert all((row - shared).abs().max(1).values.min() < 0.02 for row in decoded[:50])
 
 
 def test_unquantized_latents_are_rendered_as_they_are(blob_scene, tiny_config):

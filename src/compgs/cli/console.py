@@ -2,7 +2,7 @@
 
 import io
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from compgs.codec.reader import RangeInfo
     from compgs.evaluation.reduction import Reduction
     from compgs.evaluation.results import Results
 
@@ -55,8 +56,18 @@ def print_components(components: Mapping[str, int], anchors: int, coupled: int) 
     _print_shares(components, {"bits/anchor": anchors, "bits/coupled": coupled})
 
 
+def print_ranges(ranges: "Sequence[RangeInfo]") -> None:
+    """Beginnings of a file that are scenes."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("octree level", "anchors up to there", "bytes of the file"):
+        table.add_column(heading, justify="right")
+    for part in ranges:
+        table.add_row(f"{part.level}", f"{part.anchors:,}", f"{part.bytes:,}")
+    console.print(table)
+
+
 def _print_shares(components: Mapping[str, int], counts: Mapping[str, int]) -> None:
-    """Bytes by component, and bits by heading: of what there are so many in the file."""
+    """A table of bytes by component; each of the `counts` gets a column: bits per one of them."""
     total = sum(components.values())
     table = Table(box=None, pad_edge=False)
     for heading in ("component", "bytes", "share", *counts):

@@ -11,6 +11,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument
 from compgs.cli.console import duration, say, size
 from compgs.cli.inputs import check_bitstream
+from compgs.cli.prefixes import parse_prefix
 from compgs.outputs import check_output_folder, write_bytes
 
 
@@ -29,6 +30,8 @@ class Decode(ComputingCommand, FileArgument):
     compgs decode garden.cgs
 
     compgs decode garden.cgs -o garden
+
+    compgs decode garden.cgs --prefix 50kB
     """
 
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="FOLDER", help_behavior_hint=NO_DEFAULT)] = (
@@ -36,21 +39,29 @@ class Decode(ComputingCommand, FileArgument):
     )
     """Folder for the arrays. Without it the file is only decoded, and checked by that."""
 
+    prefix: Annotated[str | None, arg(metavar="BYTES|LEVEL", help_behavior_hint=NO_DEFAULT)] = None
+    """Decode only the beginning of the file, a coarser scene: as many bytes as have arrived (20kB), or the ranges up to
+    an octree level ("level 6"; `compgs info` lists them)."""
+
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace what is in FOLDER already."""
 
     def run(self) -> None:
-        check_bitstream(self.file)
+        if self.prefix is None:
+            check_bitstream(self.file)
+        prefix = None if self.prefix is None else parse_prefix(self.prefix, self.file)
         if self.output is not None:
             check_output_folder(self.output, overwrite=self.overwrite)
         self.prepare()
         from compgs.codec import decode
 
         start = time.perf_counter()
-        model = decode(self.file, self.device)
+        model = decode(self.file, self.device, prefix=prefix)
         seconds = time.perf_counter() - start
+        taken = self.file.stat().st_size if prefix is None else min(prefix, self.file.stat().st_size)
+        part = "" if prefix is None else "first "
         say(
-            f"{self.file}: {size(self.file.stat().st_size)}, {model.anchors:,} anchors, "
+            f"{self.file}: {part}{size(taken)}, {model.anchors:,} anchors, "
             f"{model.coupled:,} coupled primitives, decoded in {duration(seconds)}"
         )
         if self.output is None:

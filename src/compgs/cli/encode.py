@@ -1,7 +1,7 @@
 """`compgs encode`: the file of a finished run, or a smaller one from a file."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,6 +13,7 @@ from compgs.cli.inputs import check_bitstream, read_bitstream
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import CHECKPOINT_NAME, SceneSource, file_name, load_settings
 from compgs.cli.scenes import read_scene
+from compgs.cli.sizes import parse_cameras
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.errors import CheckpointError
 from compgs.outputs import check_output_file, write_bytes
@@ -59,7 +60,12 @@ class Encode(ComputingCommand, ReadingOptions):
         Path | None,
         arg(metavar="SCENE", help_behavior_hint="(default for a run: its own, where it still is)"),
     ] = None
-    """Scene whose views say what contributes and what is lost."""
+    """Scene whose photographs show what contributes and what is lost."""
+
+    cameras: Annotated[str | None, arg(metavar="N|none", help_behavior_hint="(default: the run's, 12)")] = (
+        None
+    )
+    """Cameras that the file keeps, to look from: the first N of those that stand for all training views."""
 
     geometry: Literal["octree", "tmc3"] = "octree"
     """Anchor positions by the octree coder (smaller), or by G-PCC as in the paper: then `tmc3` must be on PATH, also
@@ -75,6 +81,8 @@ class Encode(ComputingCommand, ReadingOptions):
         data = self.encoded_run() if self.source.is_dir() else read_bitstream(self.source)
         if self.reduces:
             data = self.reduced(data)
+        if self.source.is_file() and self.cameras is not None:
+            data = with_fewer_viewpoints(data, parse_cameras(self.cameras))
         write_bytes(path, data)
         from compgs.codec.reader import file_info
 
@@ -112,7 +120,7 @@ class Encode(ComputingCommand, ReadingOptions):
                 "or a .cgs file"
             )
         check_bitstream(self.source)
-        if not self.reduces:
+        if not self.reduces and self.cameras is None:
             raise UsageError(
                 f"{self.source} is a .cgs file already; give --drop or --coarser for a smaller one"
             )
@@ -126,12 +134,16 @@ class Encode(ComputingCommand, ReadingOptions):
         from compgs.codec.writer import write_content
         from compgs.training import load_run
 
-        return write_content(to_content(load_run(self.source)), self.geometry)
+        model = load_run(self.source)
+        if self.cameras is not None:
+            training = replace(model.config.training, viewpoints=parse_cameras(self.cameras))
+            model.config = replace(model.config, training=training)
+        return write_content(to_content(model), self.geometry)
 
     def reduced(self, data: bytes) -> bytes:
         from compgs.evaluation.reduction import reduce_file
 
-        cameras, held_out, where = self.cameras(data)
+        cameras, held_out, where = self.judges(data)
         say(f"what contributes, and what is lost: {where}")
         with counting("looking at cameras") as progress:
             data, reduction = reduce_file(
@@ -147,8 +159,8 @@ class Encode(ComputingCommand, ReadingOptions):
         print_reduction(reduction)
         return data
 
-    def cameras(self, data: bytes) -> "tuple[list[Camera], tuple[View, ...], str]":
-        """Cameras to judge with, held-out views, and which they are."""
+    def judges(self, data: bytes) -> "tuple[list[Camera], tuple[View, ...], str]":
+        """Cameras by which contribution and loss are measured, held-out views, and a text that says which cameras."""
         source = self.scene_source()
         if source is not None:
             scene = read_scene(source)
@@ -172,3 +184,16 @@ class Encode(ComputingCommand, ReadingOptions):
             return None
         own = load_settings(self.source).scene
         return own if Path(own.path).exists() else None
+
+
+def with_fewer_viewpoints(data: bytes, count: int) -> bytes:
+    """The file with the first `count` of its viewpoints; 0: without any."""
+    from compgs.codec.reader import read_content
+    from compgs.codec.writer import write_content
+
+    content = read_content(data)
+    if content.viewpoints is None:
+        return data
+    views = content.viewpoints.views[:count]
+    kept = replace(content.viewpoints, views=views) if views else None
+    return write_content(replace(content, viewpoints=kept))

@@ -1,15 +1,16 @@
-"""`compgs info`: what is in a file, without the time and memory of decoding it."""
+"""`compgs info`: what is in a file, and which of its beginnings are scenes, without the time and memory of decoding."""
 
 from dataclasses import dataclass
 
 from compgs.cli.command import Command, FileArgument
-from compgs.cli.console import console, print_components, say, size
+from compgs.cli.console import console, print_components, print_ranges, say, size
 from compgs.cli.inputs import read_bitstream
 
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Command, FileArgument):
-    """Show what is in a .cgs file: bytes, bits per anchor and per coupled primitive of every component.
+    """Show what is in a .cgs file: bytes of every component, and bits per anchor and per coupled primitive. Then which
+    beginnings of the file are scenes: after how many bytes the anchors up to each octree level are there.
 
     Example
 
@@ -27,3 +28,5 @@ class Info(Command, FileArgument):
         say(f"{info.anchors:,} anchors, {info.coupled:,} coupled primitives")
         console.print()
         print_components({s.name: s.bytes for s in info.sections}, info.anchors, info.coupled)
+        console.print()
+        print_ranges(info.ranges)

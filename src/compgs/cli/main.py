@@ -21,12 +21,23 @@ from compgs.cli.evaluate import Evaluate
 from compgs.cli.export import Export
 from compgs.cli.info import Info
 from compgs.cli.render import Render
+from compgs.cli.serve import Serve
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError, in_words_of_options
 from compgs.errors import CompGSError
 from compgs.interrupt import Terminated, ended_on_request, held_back
 
-COMMANDS: tuple[type[Command], ...] = (Train, Encode, Decode, Render, Evaluate, Export, Info, DemoScene)
+COMMANDS: tuple[type[Command], ...] = (
+    Train,
+    Encode,
+    Decode,
+    Render,
+    Evaluate,
+    Export,
+    Serve,
+    Info,
+    DemoScene,
+)
 
 EXAMPLE = "compgs demo-scene demo/scene && compgs train demo/scene -o demo/run --preset quick"
 

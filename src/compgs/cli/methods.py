@@ -18,7 +18,7 @@ class Method:
     """One way from a scene to a file."""
 
     extension: str  # of the file
-    settings: tuple[str, ...]  # sections (`splats`) and single settings (`training.steps`) that it looks at
+    settings: tuple[str, ...]  # sections (`splats`) and single settings (`training.steps`) that it uses
     train: Callable[..., Any]  # arguments as of `compgs.train`
     write: Callable[[Any, Path], int]  # model and path to write it to, replacing what is there; bytes
 
@@ -65,7 +65,7 @@ METHODS = {
 
 
 def check_settings_of(method: str, assignments: Iterable[str]) -> None:
-    """Of `section.key=value` assignments: raises UsageError for one that the method would not look at."""
+    """Raises UsageError for a `section.key=value` assignment of a setting that the method does not use."""
     known = METHODS[method].settings
     for assignment in assignments:
         name = assignment.partition("=")[0].strip()

@@ -54,7 +54,7 @@ def training() -> Iterator[Callable[["TrainingStatus"], None]]:
 
 
 def parts_of(status: "TrainingStatus") -> list[str]:
-    """What there is to say, what matters most first."""
+    """The parts of a progress line, the most important first."""
     rate = 1 / status.seconds_per_step if status.seconds_per_step > 0 else 0.0
     return [
         f"step {status.step:,} of {status.steps:,}",
@@ -69,7 +69,7 @@ def parts_of(status: "TrainingStatus") -> list[str]:
 
 
 def fitting(status: "TrainingStatus", room: int) -> str:
-    """As many of the parts, from the first on, as there is room for: in columns of a terminal."""
+    """The first parts, as many as fit into the columns of the terminal."""
     shown, *others = parts_of(status)
     for part in others:
         if len(shown) + 2 + len(part) > room:

@@ -58,13 +58,19 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
     """Camera file to render, instead of a scene."""
 
     frames: Annotated[int, arg(metavar="N")] = 60
-    """Images of the circle."""
+    """Images of the way through the scene."""
+
+    path: Annotated[
+        Literal["cameras", "orbit"] | None,
+        arg(help_behavior_hint="(default: cameras, for a file that has them)"),
+    ] = None
+    """The way: along the cameras that the file keeps, or in a circle around the scene."""
 
     width: Annotated[int, arg(metavar="PIXELS")] = 640
-    """Of the circle's images."""
+    """Of the images."""
 
     height: Annotated[int, arg(metavar="PIXELS")] = 480
-    """Of the circle's images."""
+    """Of the images."""
 
     up: Annotated[tuple[float, float, float], arg(metavar="X Y Z")] = (0.0, -1.0, 0.0)
     """Direction of the sky, for the circle."""
@@ -95,7 +101,7 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
         model = open_scene(self.file, device, scene.background if scene else BLACK)
         if self.background is not None:
             model = model.over(self.background)
-        self.render(model, views or self.circle(model))
+        self.render(model, views or self.way(model))
 
     def check_values(self) -> None:
         """Raises UsageError."""
@@ -125,6 +131,17 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
         if not chosen:
             raise UsageError(f"--split {self.split}: the scene has no such views")
         return [(view.name, view.camera) for view in chosen]
+
+    def way(self, model: "Renderable") -> "Sequence[tuple[str, Camera]]":
+        """Along the file's cameras, or in a circle. Raises UsageError."""
+        cameras = getattr(model, "viewpoints", ())
+        if self.path == "orbit" or (self.path is None and len(cameras) < 2):
+            return self.circle(model)
+        if len(cameras) < 2:
+            raise UsageError(f"--path cameras: {self.file} keeps {len(cameras)} cameras; use --path orbit")
+        from compgs.evaluation.tour import tour
+
+        return tour(cameras, frames=self.frames, width=self.width, height=self.height)
 
     def circle(self, model: "Renderable") -> "Sequence[tuple[str, Camera]]":
         import numpy as np

@@ -1,8 +1,9 @@
-"""Sizes of files as people type them."""
+"""Sizes of files and other counts as people type them."""
 
 import re
 
 from compgs.cli.usage import UsageError
+from compgs.config import MAX_VIEWPOINTS
 
 UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30}
 
@@ -19,3 +20,12 @@ def parse_size(text: str, option: str) -> int:
     if count < 1:
         raise UsageError(f"{option} {text}: expected at least one byte")
     return count
+
+
+def parse_cameras(text: str) -> int:
+    """`12`, or `none`. Raises UsageError."""
+    if text.strip().lower() == "none":
+        return 0
+    if not text.strip().isdigit() or int(text) > MAX_VIEWPOINTS:
+        raise UsageError(f"--cameras {text}: expected 0 to {MAX_VIEWPOINTS}, or none")
+    return int(text)

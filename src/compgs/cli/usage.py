@@ -14,7 +14,7 @@ OPTIONS = {
 }
 
 
-# What messages tell those to give who call from Python, and what is meant by it here.
+# Messages of the package name arguments of Python functions; on the command line these options take their place.
 OF_PYTHON = {"overwrite=True": "--overwrite", "resume=True": "--resume", "images=...": "--images"}
 
 

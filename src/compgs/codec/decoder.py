@@ -14,8 +14,9 @@ from compgs.codec.integer_network import FRACTION_BITS
 from compgs.codec.reader import read_latents
 from compgs.codec.viewpoint_cameras import camera_from_viewpoint
 from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile
+from compgs.model.constants import SHARED_RESIDUALS
+from compgs.model.heads import HeadDimensions, make_heads
 from compgs.model.hybrid_model import HybridModel
-from compgs.model.prediction import SHARED_RESIDUALS, PredictionHeads
 from compgs.model.primitives import Primitives
 
 # Primitives of an anchor that stands for m anchors, of which only it has arrived, are m to this power as large: their
@@ -47,7 +48,7 @@ def decode(
 def from_latents(content: FileContent, latents: Latents, device: torch.device) -> HybridModel:
     """Integers to floats: one rounding a value, the same on every machine."""
     d = content.dimensions
-    heads = PredictionHeads(d.reference_dim, d.residual_dim, d.width, d.heads)
+    heads = make_heads(d.heads, HeadDimensions(d.reference_dim, d.residual_dim, d.width))
     stored = dict(content.heads)
     shapes = {name: tuple(p.shape) for name, p in heads.named_parameters()}
     if d.channels(Role.RESIDUAL) == 0:

@@ -25,9 +25,8 @@ from compgs.entropy.factorized import FactorizedDensity
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import NotEncodable
-from compgs.model.prediction import SHARED_RESIDUALS
 from compgs.outputs import check_output_file, write_bytes
-from compgs.trained_model import BIAS_BITS, SHARED_RESIDUAL_BITS, TrainedModel
+from compgs.trained_model import TrainedModel
 
 ONE = 1 << FRACTION_BITS
 
@@ -67,8 +66,7 @@ def encode(
 @torch.no_grad()
 def to_content(model: TrainedModel) -> FileContent:
     """Everything that goes into the file, as integers. Anchors without a coupled primitive are left out."""
-    config = model.config
-    m, e, entropy = config.model, config.entropy, model.entropy
+    m, entropy = model.config.model, model.entropy
     for name, parameter in model.named_parameters():
         if not torch.isfinite(parameter).all():
             raise NotEncodable(f"{name} holds values that are not finite: the training has diverged")
@@ -85,15 +83,9 @@ def to_content(model: TrainedModel) -> FileContent:
     references = groups[-1].latents
     scales = rows(model.log_scales) / torch.from_numpy(steps.astype(np.float64))
     shape = GroupShape(Role.LOG_SCALES, LOG_SCALES, tuple(map(float, steps)), (len(groups) - 1,))
-    groups.append(_coded(shape, scales, [references], entropy.covariance_network, e.network_bits))
+    groups.append(_coded(shape, scales, [references], entropy.covariance_network, model.weights.network))
     if m.residuals:
         groups += _residual_groups(model, rows(model.residuals), references, first=len(groups))
-    heads = [
-        (name, quantized_tensor(p, e.head_bits if p.dim() > 1 else BIAS_BITS))
-        for name, p in model.heads.named_parameters()
-    ]
-    if not m.residuals:
-        heads.append((SHARED_RESIDUALS, quantized_tensor(model.shared_residuals(), SHARED_RESIDUAL_BITS)))
     slots = (m.coupled_primitives, m.residual_dim)
     return FileContent(
         coupled_primitives=m.coupled_primitives,
@@ -116,7 +108,10 @@ def to_content(model: TrainedModel) -> FileContent:
             )
             for coded in groups
         ),
-        heads=tuple(heads),
+        heads=tuple(
+            (name, quantized_tensor(tensor, model.weights.bits(name, tensor)))
+            for name, tensor in model.head_tensors().items()
+        ),
         viewpoints=_viewpoints(model),
         metadata={"creator": f"compgs {__version__}"},
     )
@@ -141,7 +136,7 @@ def _reference_groups(model: TrainedModel, f: Tensor) -> list[_Coded]:
     e, entropy = model.config.entropy, model.entropy
     side = _hyperprior(entropy.reference_analysis, entropy.reference_density, f)
     shape = GroupShape(Role.REFERENCE, f.shape[1], (_float32(e.reference_step),), (0,))
-    return [side, _coded(shape, f, [side.latents], entropy.reference_network, e.network_bits)]
+    return [side, _coded(shape, f, [side.latents], entropy.reference_network, model.weights.network)]
 
 
 def _residual_groups(model: TrainedModel, g: Tensor, references: np.ndarray, first: int) -> list[_Coded]:
@@ -152,7 +147,7 @@ def _residual_groups(model: TrainedModel, g: Tensor, references: np.ndarray, fir
     side = _hyperprior(entropy.residual_analysis, entropy.residual_density, g)
     shape = GroupShape(Role.RESIDUAL, m.residual_dim, (_float32(e.residual_step),), (1, first))
     context = [references, side.latents]
-    return [side, _coded(shape, g, context, entropy.residual_network, e.network_bits)]
+    return [side, _coded(shape, g, context, entropy.residual_network, model.weights.network)]
 
 
 def _hyperprior(analysis: nn.Module, density: FactorizedDensity, y: Tensor) -> _Coded:

@@ -139,6 +139,11 @@ def unpack(data: bytes, *, prefix: bool = False) -> list[Section]:
             have = {s.number for s in sections}
             if prefix and have.issuperset(REQUIRED):
                 return sections
+            if prefix:
+                needed = next(end for kind, end in section_ends(data) if kind == LATENTS)
+                raise TruncatedSection(
+                    f"{section.name}: of {len(data)} bytes nothing can be shown yet, the first scene takes {needed}"
+                )
             raise TruncatedSection(
                 f"{section.name}: header promises {length} bytes, the file ends after {len(section.data)}; "
                 "copy or download it again"

@@ -24,7 +24,7 @@ Limit = tuple[str, int, int]
 
 
 def check_amount(limit: Limit, amount: int, size: int, section: str) -> None:
-    """Raises CorruptSection if a file of `size` bytes must not have so much."""
+    """Raises CorruptSection if `amount` is more than a file of `size` bytes may have."""
     what, free, per_byte = limit
     if amount > free + per_byte * size:
         raise CorruptSection(
@@ -33,13 +33,14 @@ def check_amount(limit: Limit, amount: int, size: int, section: str) -> None:
 
 
 def symbols(dimensions: Dimensions, anchors: int) -> int:
-    """Of so many anchors with all their coupled primitives."""
+    """Symbols of so many anchors with all their coupled primitives."""
     return anchors * dimensions.symbols_per_anchor()
 
 
-def least_bytes(content: FileContent) -> int:
-    """That a file of this content must have."""
-    anchors, coupled = len(content.coordinates), int(content.mask.sum())
+def least_bytes(content: FileContent, anchors: int | None = None) -> int:
+    """Bytes that a file needs at least, or its beginning up to so many of the content's anchors (canonical order)."""
+    anchors = len(content.coordinates) if anchors is None else anchors
+    coupled = int(content.mask[:anchors].sum())
     products = sum(g.prior.products for g in content.groups if isinstance(g.prior, IntegerNetwork))
     weights = sum(tensor.values.size for _, tensor in content.heads)
     amounts = (

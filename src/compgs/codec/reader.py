@@ -33,6 +33,7 @@ from compgs.codec.format import (
     VIEWPOINTS,
     Section,
     container_bytes,
+    section_ends,
     unpack,
 )
 from compgs.codec.latents import Prior, RangeHead, decode_range, read_head, stream_sizes
@@ -58,7 +59,7 @@ class SectionInfo:
 
 @dataclass(frozen=True)
 class RangeInfo:
-    """A beginning of the file that is a scene."""
+    """A prefix of the file that is a scene, and where it ends."""
 
     level: int  # of the octree
     anchors: int  # up to this level
@@ -87,7 +88,9 @@ class FileInfo:
 
 
 def group_names(dimensions: Dimensions) -> list[str]:
-    """What people call the groups; a side group is named after the next one that takes it."""
+    """What people call the groups; a side group is named after the next one that takes it. No two share a name: of
+    several of a kind all but the first have their number.
+    """
     names = {
         Role.REFERENCE: "reference embeddings",
         Role.LOG_SCALES: "log scales",
@@ -103,7 +106,8 @@ def group_names(dimensions: Dimensions) -> list[str]:
             users[0] if users else shape.role, ""
         )
         result.append(f"{kind}hyperprior")
-    return result
+    counted = [(name, result[: i + 1].count(name)) for i, name in enumerate(result)]
+    return [name if count == 1 else f"{name} {count}" for name, count in counted]
 
 
 def read_content(data: bytes) -> FileContent:
@@ -162,7 +166,8 @@ def read_latents(
         raise CorruptSection(
             f"masks: {int(mask.sum())} coupled primitives exist, the scene section promises {scene.coupled}"
         )
-    _check_ranges(heads_of_ranges, level_counts(coordinates), mask, whole=not prefix)
+    complete = len(ranges) == sum(number == LATENTS for number, _ in section_ends(data))
+    _check_ranges(heads_of_ranges, level_counts(coordinates), mask, whole=complete)
     places = coordinate_context(coordinates)[:anchors]
     whole = anchors == scene.anchors
     stands_for = None if whole else represented(coordinates, heads_of_ranges[-1].level)
@@ -199,7 +204,7 @@ def _priors(d: Dimensions, networks: Iterator, tables: Iterator) -> list[Prior]:
 
 
 def _check_ranges(heads: list[RangeHead], counts: np.ndarray, mask: np.ndarray, *, whole: bool) -> None:
-    """The ranges must be those of the octree's levels, and all of them in a `whole` file."""
+    """The ranges must be those of the octree's levels, and all of them where the file has arrived `whole`."""
     place, first = SECTION_NAMES[LATENTS], 0
     levels = [head.level for head in heads]
     if levels != sorted(set(levels)) or levels[-1] >= len(counts):

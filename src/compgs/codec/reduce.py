@@ -3,7 +3,7 @@
 Both work on what the file holds and leave alone what other symbols are conditioned on: references and hyperpriors keep
 their symbols, so that everything that is kept decodes to what it was. Residual embeddings keep their step: most of
 their symbols are 0, 1 or -1, and a coarser step either leaves those where they are or loses them all
-(docs/rates.md has what it costs).
+(measured in docs/log/2026-11-21-sizes.md).
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ from compgs.errors import NotEncodable
 
 
 def without_coupled(content: FileContent, kept: np.ndarray) -> FileContent:
-    """Some of the P coupled primitives only (kept: [P] bool, in the file's order), and the anchors that have one."""
+    """The content with only the coupled primitives that are `kept`, [P] bool in the file's order, and their anchors."""
     mask = content.mask.copy()
     mask[mask] = kept
     anchors = mask.any(1)

@@ -8,7 +8,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.codec.viewpoints import MAX_LENSES, MAX_SIDE, Vector, Viewpoint, Viewpoints
-from compgs.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
+from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
 
 
 def viewpoints_from_cameras(

@@ -7,6 +7,7 @@ import numpy as np
 
 from compgs.codec.anchor_order import canonical_order, level_counts
 from compgs.codec.content import FileContent, Group, Role, coordinate_context
+from compgs.codec.fields import FieldReader
 from compgs.codec.format import (
     HEADS,
     LATENTS,
@@ -28,7 +29,7 @@ from compgs.codec.format import (
     pack,
 )
 from compgs.codec.integer_network import IntegerNetwork
-from compgs.codec.latents import chosen_levels, encode_range
+from compgs.codec.latents import chosen_levels, encode_range, read_head
 from compgs.codec.limits import least_bytes
 from compgs.codec.mask_coder import encode_masks
 from compgs.codec.octree import encode_positions
@@ -76,12 +77,14 @@ def write_content(
         Section(TABLES, encode_tables(tables)),
         Section(NETWORKS, encode_networks(networks)),
         Section(HEADS, encode_heads(content.heads)),
-        *_ranges(content, counts, chosen_levels(counts) if levels is None else levels),
     ]
+    ranges = _ranges(content, counts, chosen_levels(counts) if levels is None else levels)
+    padding = _padding(content, sections, ranges)
+    if padding:  # before the ranges, so that the beginnings of the file that are scenes are padded, too
+        sections.append(Section(PADDING, bytes(padding)))
     if content.metadata:
-        sections.append(Section(METADATA, encode_metadata(content.metadata)))
-    padding = _padding(content, sections)
-    return pack([*sections, Section(PADDING, bytes(padding))] if padding else sections)
+        ranges.append(Section(METADATA, encode_metadata(content.metadata)))
+    return pack(sections + ranges)
 
 
 def _positions(coordinates: np.ndarray, geometry: Geometry) -> Section:
@@ -171,7 +174,14 @@ def _reordered(content: FileContent, order: np.ndarray) -> FileContent:
     )
 
 
-def _padding(content: FileContent, sections: list[Section]) -> int:
-    """Zero bytes to add to a file that says more than its size allows."""
-    size = container_bytes(len(sections)) + sum(len(section.data) for section in sections)
-    return max(0, least_bytes(content) - size)
+def _padding(content: FileContent, before: list[Section], ranges: list[Section]) -> int:
+    """Number of zero bytes to add before the ranges, so that the file, and its beginning up to the end of each range,
+    is long enough for its content (`codec/limits.py`).
+    """
+    size = container_bytes(len(before) + len(ranges)) + sum(len(section.data) for section in before)
+    anchors = padding = 0
+    for section in ranges:
+        size += len(section.data)
+        anchors += read_head(FieldReader(section.data, section.name)).anchors
+        padding = max(padding, least_bytes(content, anchors) - size)
+    return padding

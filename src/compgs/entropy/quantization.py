@@ -50,7 +50,8 @@ class UniformNoise:
     """Noise in [-0.5, 0.5) that stands for rounding inside the likelihood.
 
     Cut at random places from a pool that is drawn once: half a million new numbers in every step would take as long
-    as the entropy networks.
+    as the entropy networks. What the pool cannot give without repeating itself is drawn anew, from a seed of `places`,
+    so that a run goes on with the same numbers wherever it was stopped.
     """
 
     POOL = 1 << 22
@@ -64,8 +65,8 @@ class UniformNoise:
         """Noise of the shape of `like`, to be read only."""
         count = like.numel()
         if count > self.POOL // 2:
-            parts = [self(part) for part in like.view(-1).split(self.POOL // 2)]
-            return torch.cat(parts).view_as(like)
+            generator = torch.Generator(like.device).manual_seed(int(self.places.integers(1 << 62)))
+            return torch.rand(like.shape, generator=generator, device=like.device) - 0.5
         place = int(self.places.integers(self.POOL - count + 1))
         return self.pool[place : place + count].view(like.shape)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
-from compgs.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
+from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
 
 MAX_SIDE = 16_384  # pixels
 
@@ -140,7 +140,7 @@ def orbit(
 def surround(positions: np.ndarray, *, width: int = 320, height: int = 240) -> list[tuple[str, Camera]]:
     """72 cameras that see a scene as visitors would: three heights, near and far, all around; positions as in `orbit`.
 
-    For judging what matters in a scene of which nothing but the file is there.
+    Used to judge what matters in a scene when there are no photographs, only the file.
     """
     return [
         (f"{name}, {elevation:.0f} degrees high, {distance} radii away", camera)

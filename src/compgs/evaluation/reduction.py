@@ -27,7 +27,7 @@ IDENTICAL = 99.0  # dB that identical images count for in a mean
 
 @dataclass(frozen=True)
 class Side:
-    """A file before or after."""
+    """A file, before or after it was made smaller."""
 
     bytes: int
     anchors: int
@@ -37,13 +37,13 @@ class Side:
 
 @dataclass(frozen=True)
 class Reduction:
-    """What a file was, and what has become of it."""
+    """A file before and after it was made smaller, and the loss."""
 
-    drop: float  # share of the coupled primitives that went
+    drop: float  # share of the coupled primitives left out
     coarser: float  # times the covariances' step
     before: Side
     after: Side
-    cameras: int  # that importance and loss were looked at with
+    cameras: int  # with which importance and loss were measured
     psnr: float  # dB of the new file's renderings against the old one's, mean over these cameras
 
     def to_dict(self) -> dict[str, Any]:
@@ -126,7 +126,7 @@ def most_important(
 
 
 def described(content: FileContent, drop: float, coarser: float) -> str:
-    """For the metadata: what was done to the file, after what had been done before."""
+    """Text for the metadata: this reduction, after those that the file had before."""
     steps = [f"drop {drop:g}"] * (drop > 0) + [f"coarser {coarser:g}"] * (coarser > 1)
     earlier = content.metadata.get("reduced")
     return ", ".join([*([earlier] if earlier else []), *steps])

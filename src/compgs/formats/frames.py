@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from compgs.formats.arrays import SplatArrays, degree_of
-from compgs.rotations import nearest_rotation, quaternion_from_rotation
+from compgs.numerics.rotations import nearest_rotation, quaternion_from_rotation
 
 RIGHT_UP_BACK = (1, -1, -1)
 LEFT_UP_FORWARD = (-1, -1, 1)

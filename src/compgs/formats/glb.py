@@ -36,7 +36,7 @@ from compgs.formats.arrays import (
     normalized,
 )
 from compgs.formats.frames import LEFT_UP_FORWARD, transformed, turned
-from compgs.rotations import rotation_from_quaternion
+from compgs.numerics.rotations import rotation_from_quaternion
 
 MAGIC = b"glTF"
 EXTENSION = "KHR_gaussian_splatting"

@@ -2,8 +2,11 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from compgs.model.arrays import PrimitiveArrays
 
 
 @dataclass(frozen=True)
@@ -15,9 +18,7 @@ class Primitives:
     """
 
     positions: Tensor  # [N, 3] world units
-    log_scales: (
-        Tensor  # [N, 6] natural log of (0:3) reach of the offsets, (3:6) size of the primitives, in voxels
-    )
+    log_scales: Tensor  # [N, 6] natural log of (0:3) reach of a translation, (3:6) size, in voxels
     references: Tensor  # [N, reference_dim]
     residuals: Tensor  # [P, residual_dim], P coupled primitives
     anchor_index: Tensor  # [P] int64, ascending: row of the anchor of each coupled primitive
@@ -27,7 +28,7 @@ class Primitives:
         return len(self.positions)
 
     @property
-    def offset_scales(self) -> Tensor:
+    def reach(self) -> Tensor:
         """[N, 3] world units per unit of a predicted translation."""
         return self.log_scales[:, :3].exp() * self.voxel_size
 
@@ -35,6 +36,21 @@ class Primitives:
     def sizes(self) -> Tensor:
         """[N, 3] world units: standard deviations of the anchor's own covariance."""
         return self.log_scales[:, 3:].exp() * self.voxel_size
+
+    def arrays(self) -> PrimitiveArrays:
+        """The same for the kernels, without gradients; copies nothing that is contiguous float32 on the CPU."""
+
+        def array(tensor: Tensor) -> np.ndarray:
+            return tensor.detach().cpu().contiguous().numpy()
+
+        return PrimitiveArrays(
+            positions=array(self.positions),
+            log_scales=array(self.log_scales),
+            references=array(self.references),
+            residuals=array(self.residuals),
+            anchor_index=array(self.anchor_index),
+            voxel_size=self.voxel_size,
+        )
 
 
 def every_slot(anchors: int, coupled: int, device: torch.device | None = None) -> Tensor:
@@ -53,4 +69,17 @@ def select_anchors(primitives: Primitives, chosen: Tensor) -> Primitives:
         references=primitives.references[chosen],
         residuals=primitives.residuals[kept],
         anchor_index=rows[primitives.anchor_index[kept]],
+    )
+
+
+def anchor_range(primitives: Primitives, anchors: slice, coupled: slice) -> Primitives:
+    """A range of anchors, from a row to another, and the range of all their coupled primitives."""
+    p = primitives
+    return replace(
+        primitives,
+        positions=p.positions[anchors],
+        log_scales=p.log_scales[anchors],
+        references=p.references[anchors],
+        residuals=p.residuals[coupled],
+        anchor_index=p.anchor_index[coupled] - anchors.start,
     )

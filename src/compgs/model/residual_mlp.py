@@ -1,250 +1,94 @@
-"""The residual MLP on the CPU, fused: forward, and backward with recomputation.
+"""The residual MLP of the prediction networks (CompGS Sec. 3.2).
 
-    first = residuals R + shared[anchor]            R [G, H + O]; shared [A, H + O], computed once per anchor
-    x     = leaky(first[:, :H])
-    x     = x + leaky(x V1 + a1) V2 + a2            once per block
-    out   = x U + first[:, H:]
+    [f, g] ─► linear ─► leaky ReLU ─► blocks x (x + linear ─ leaky ReLU ─ linear) ─► linear ─► + ─► out
+       └──────────────────────────────── linear (skip) ────────────────────────────────────────┘
 
-`H` is the hidden width, `O` the outputs, `G` the residual channels. Coupled primitives are taken ROWS at a
-time, so that all activations of a group stay in the core's cache; the products are BLAS calls on such groups
-(a whole pass takes 0.55 to 0.6 of the time of the same sums as loops vectorized by LLVM). Nothing is kept for
-the backward pass but the inputs: the activations are computed again, group by group.
-
-Gradients of the weights are sums over all primitives: they are accumulated in CHUNKS parts and then added in
-order. Parts end where an anchor ends, so that each anchor's gradient is summed by one thread. The result
-depends on neither the number of threads nor their timing.
+`f` are the features of an anchor, `g` the residual embedding of one of its coupled primitives. What the first
+layer and the skip make of `f` is computed once per anchor. All weights are [in, out]; rows of `f` come before
+those of `g`. This is the readable version; on the CPU in float32 its twin `residual_mlp_kernels.py` does the work.
 """
 
-import numpy as np
-from numba import njit, prange
+import math
 
-# A power of two, as in the entropy networks.
-NEGATIVE_SLOPE = 2.0**-6
-ROWS = 128  # primitives in a group: all activations of a group fit into the second-level cache
-CHUNKS = 16  # partial sums of a weight gradient
+import torch
+from torch import Tensor, nn
 
-_SLOPE = np.float32(NEGATIVE_SLOPE)
-_FASTMATH = {"contract", "nsz", "arcp"}
-
-
-@njit(fastmath=_FASTMATH, cache=True)
-def _leaky_gradient(d, x, n):
-    """d[:n] *= the slope where the activation x was negative; leaky keeps the sign, so its output tells."""
-    for i in range(n):
-        d[i] = d[i] if x[i] > np.float32(0) else _SLOPE * d[i]
+from compgs.model.arrays import MLPArrays
+from compgs.model.autograd import KernelMLP
+from compgs.model.constants import NEGATIVE_SLOPE
+from compgs.numerics.linear import linear
 
 
-@njit(fastmath=_FASTMATH, cache=True)
-def _add(x, y, n):
-    """x[:n] += y[:n], flat."""
-    for i in range(n):
-        x[i] += y[i]
+def _linear(inputs: int, outputs: int) -> tuple[nn.Parameter, nn.Parameter]:
+    """Weight [inputs, outputs] and bias [outputs], uniform in +-1/sqrt(inputs)."""
+    bound = 1.0 / math.sqrt(inputs)
+    weight = nn.Parameter(torch.empty(inputs, outputs).uniform_(-bound, bound))
+    return weight, nn.Parameter(torch.empty(outputs).uniform_(-bound, bound))
 
 
-@njit(fastmath=_FASTMATH, cache=True)
-def _add_leaky(x, bias, n):
-    """x[:n] = leaky(x + bias), flat."""
-    for i in range(n):
-        y = x[i] + bias[i]
-        x[i] = max(y, _SLOPE * y)
+class ResidualBlock(nn.Module):
+    """x + linear(leaky(linear(x))), `width` channels."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight1, self.bias1 = _linear(width, width)
+        self.weight2, self.bias2 = _linear(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        hidden = nn.functional.leaky_relu(torch.addmm(self.bias1, x, self.weight1), NEGATIVE_SLOPE)
+        return x + torch.addmm(self.bias2, hidden, self.weight2)
 
 
-@njit(fastmath=_FASTMATH, cache=True)
-def _add_two(x, y, bias, n):
-    """x[:n] = (x + bias) + y, flat."""
-    for i in range(n):
-        x[i] = x[i] + bias[i] + y[i]
+class ResidualMLP(nn.Module):
+    """Anchor features and residual embeddings in, one row of outputs per coupled primitive out.
 
-
-@njit(cache=True)
-def tiled(biases):
-    """[blocks, H] -> [blocks, ROWS * H]: a bias for each number of a group, so that adding it is one flat loop."""
-    H = biases.shape[1]
-    tiles = np.empty((len(biases), ROWS * H), np.float32)
-    for b in range(len(biases)):
-        for i in range(ROWS):
-            tiles[b, i * H : (i + 1) * H] = biases[b]
-    return tiles
-
-
-@njit(fastmath=_FASTMATH, cache=True)
-def _add_shared(first, shared, index, x):
-    """first[i] += shared[index[i]]; x [n, H] = leaky(its first columns)."""
-    H, F = x.shape[1], first.shape[1]
-    for i in range(len(index)):
-        anchor = index[i]
-        for j in range(H):
-            y = first[i, j] + shared[anchor, j]
-            x[i, j] = max(y, _SLOPE * y)
-        for j in range(H, F):
-            first[i, j] += shared[anchor, j]
-
-
-@njit(fastmath=_FASTMATH, cache=True)
-def activations(residuals, index, shared, R, V1, a1_tiles, V2, a2_tiles, first, x, h):
-    """One group: fills the last O columns of first [n, H + O], x [blocks + 1, ROWS, H] and h [blocks, ROWS, H]."""
-    n, H = residuals.shape[0], V1.shape[2]
-    np.dot(residuals, R, first)
-    _add_shared(first, shared, index, x[0])
-    for b in range(V1.shape[0]):
-        np.dot(x[b, :n], V1[b], h[b, :n])
-        _add_leaky(h[b].ravel(), a1_tiles[b], n * H)
-        np.dot(h[b, :n], V2[b], x[b + 1, :n])
-        _add_two(x[b + 1].ravel(), x[b].ravel(), a2_tiles[b], n * H)
-
-
-@njit(inline="always")
-def _chosen(residuals, rows, p, q, scratch):
-    """Residuals of a group: a part of the array, or gathered."""
-    if len(rows) == 0:
-        return residuals[p:q]
-    for i in range(q - p):
-        for c in range(residuals.shape[1]):
-            scratch[i, c] = residuals[rows[p + i], c]
-    return scratch[: q - p]
-
-
-@njit(parallel=True, cache=True)
-def forward(
-    residuals,  # [P, G] float32
-    rows,  # [M] int64, ascending: those that are computed; [0]: all, M = P
-    index,  # [M] int64: row of shared, ascending
-    shared,  # [A, H + O] float32: the anchor's part of the first layer and of the skip, biases included
-    R,  # [G, H + O]
-    V1,  # [blocks, H, H]
-    a1,  # [blocks, H]
-    V2,  # [blocks, H, H]
-    a2,  # [blocks, H]
-    U,  # [H, O]
-    out,  # [M, O], written
-):
-    M, G, H, O, blocks = len(index), len(R), U.shape[0], U.shape[1], len(V1)
-    groups = (M + ROWS - 1) // ROWS
-    # Several groups to a task: scratch memory is allocated once per task.
-    tasks = min(groups, 8 * CHUNKS)
-    tiles1, tiles2 = tiled(a1), tiled(a2)
-    for t in prange(tasks):
-        own = np.empty((ROWS, G), np.float32)
-        first = np.empty((ROWS, H + O), np.float32)
-        x = np.empty((blocks + 1, ROWS, H), np.float32)
-        h = np.empty((blocks, ROWS, H), np.float32)
-        for g in range(groups * t // tasks, groups * (t + 1) // tasks):
-            p, q = g * ROWS, min(M, (g + 1) * ROWS)
-            n = q - p
-            taken = _chosen(residuals, rows, p, q, own)
-            activations(taken, index[p:q], shared, R, V1, tiles1, V2, tiles2, first[:n], x, h)
-            np.dot(x[blocks, :n], U, out[p:q])
-            for i in range(n):
-                for j in range(O):
-                    out[p + i, j] += first[i, H + j]
-
-
-@njit(cache=True)
-def chunk_bounds(index, chunks):
-    """[chunks + 1] rows of equal parts, moved forward to where the next anchor begins."""
-    M = len(index)
-    bounds = np.zeros(chunks + 1, np.int64)
-    for c in range(1, chunks + 1):
-        row = max(M * c // chunks, bounds[c - 1])
-        while 0 < row < M and index[row] == index[row - 1]:
-            row += 1
-        bounds[c] = row
-    return bounds
-
-
-@njit(fastmath=_FASTMATH, cache=True)
-def _first_gradient(first, dx, x, d, index, d_shared):
-    """first [n, H + O] becomes its own gradient: from dx, of x = leaky(first[:, :H]), and d, of first[:, H:]. Each row
-    is added to its anchor's in d_shared.
+    The bias of the last layer is `output_bias`; the skip has none of its own.
     """
-    H, O = x.shape[1], d.shape[1]
-    for i in range(len(d)):
-        anchor = index[i]
-        for j in range(H):
-            first[i, j] = dx[i, j] if x[i, j] > np.float32(0) else _SLOPE * dx[i, j]
-        for j in range(O):
-            first[i, H + j] = d[i, j]
-        if len(d_shared) > 0:
-            for j in range(H + O):
-                d_shared[anchor, j] += first[i, j]
 
+    def __init__(
+        self, anchor_dim: int, residual_dim: int, outputs: int, width: int = 32, blocks: int = 1
+    ) -> None:
+        super().__init__()
+        self.anchor_dim = anchor_dim
+        self.width = width
+        self.input_weight, self.input_bias = _linear(anchor_dim + residual_dim, width)
+        self.blocks = nn.ModuleList(ResidualBlock(width) for _ in range(blocks))
+        self.output_weight, self.output_bias = _linear(width, outputs)
+        self.skip_weight, _ = _linear(anchor_dim + residual_dim, outputs)
 
-@njit(parallel=True, cache=True)
-def backward(
-    residuals,
-    rows,
-    index,
-    shared,
-    R,
-    V1,
-    a1,
-    V2,
-    a2,
-    U,
-    d_out,  # [M, O]
-    bounds,  # [chunks + 1] from chunk_bounds
-    d_residuals,  # [P, G] added to; [0, G] if not wanted
-    d_shared,  # [A, H + O] added to; [0, H + O] if not wanted
-    d_weights,  # [chunks, size] zero, written: R, per block V1, a1, V2, a2, then U; [chunks, 0] if not wanted
-):
-    G, H, O, blocks = len(R), U.shape[0], U.shape[1], len(V1)
-    F = H + O
-    want_residuals, want_weights = len(d_residuals) > 0, d_weights.shape[1] > 0
-    # BLAS takes a transposed right factor at half the rate.
-    R_t, U_t = np.ascontiguousarray(R.T), np.ascontiguousarray(U.T)
-    V1_t, V2_t = np.empty_like(V1), np.empty_like(V2)
-    for b in range(blocks):
-        V1_t[b], V2_t[b] = V1[b].T, V2[b].T
-    tiles1, tiles2 = tiled(a1), tiled(a2)
-    for c in prange(len(bounds) - 1):
-        own = np.empty((ROWS, G), np.float32)
-        first = np.empty((ROWS, F), np.float32)
-        x = np.empty((blocks + 1, ROWS, H), np.float32)
-        h = np.empty((blocks, ROWS, H), np.float32)
-        dx = np.empty((ROWS, H), np.float32)
-        dh = np.empty((ROWS, H), np.float32)
-        part = np.empty((ROWS, H), np.float32)
-        part_own = np.empty((ROWS, G), np.float32)
-        product_R = np.empty((G, F), np.float32)
-        product_V = np.empty((H, H), np.float32)
-        product_U = np.empty((H, O), np.float32)
-        ones, column_sums = np.ones(ROWS, np.float32), np.empty(H, np.float32)
-        weights = d_weights[c]
-        for p in range(bounds[c], bounds[c + 1], ROWS):
-            q = min(bounds[c + 1], p + ROWS)
-            n = q - p
-            taken = _chosen(residuals, rows, p, q, own)
-            activations(taken, index[p:q], shared, R, V1, tiles1, V2, tiles2, first[:n], x, h)
-            d = d_out[p:q]
-            np.dot(d, U_t, dx[:n])
-            at = G * F + blocks * 2 * (H * H + H)
-            if want_weights:
-                np.dot(x[blocks, :n].T, d, product_U)
-                _add(weights[at:], product_U.ravel(), H * O)
-            for b in range(blocks - 1, -1, -1):
-                at -= 2 * (H * H + H)
-                np.dot(dx[:n], V2_t[b], dh[:n])
-                _leaky_gradient(dh.ravel(), h[b].ravel(), n * H)
-                if want_weights:
-                    np.dot(x[b, :n].T, dh[:n], product_V)
-                    _add(weights[at:], product_V.ravel(), H * H)
-                    np.dot(ones[:n], dh[:n], column_sums)
-                    _add(weights[at + H * H :], column_sums, H)
-                    np.dot(h[b, :n].T, dx[:n], product_V)
-                    _add(weights[at + H * H + H :], product_V.ravel(), H * H)
-                    np.dot(ones[:n], dx[:n], column_sums)
-                    _add(weights[at + 2 * H * H + H :], column_sums, H)
-                np.dot(dh[:n], V1_t[b], part[:n])
-                _add(dx.ravel(), part.ravel(), n * H)
-            _first_gradient(first, dx, x[0], d, index[p:q], d_shared)
-            if want_weights:
-                np.dot(taken.T, first[:n], product_R)
-                _add(weights, product_R.ravel(), G * F)
-            if want_residuals:
-                np.dot(first[:n], R_t, part_own[:n])
-                if len(rows) == 0:
-                    _add(d_residuals[p:q].ravel(), part_own.ravel(), n * G)
-                else:
-                    for i in range(n):
-                        for j in range(G):
-                            d_residuals[rows[p + i], j] += part_own[i, j]
+    def forward(
+        self,
+        anchor_features: Tensor,  # [A, anchor_dim]
+        residuals: Tensor,  # [M, residual_dim]
+        anchor_index: Tensor,  # [M] int64, ascending: row of anchor_features of each coupled primitive
+    ) -> Tensor:  # [M, outputs]
+        shared, weights = self.begin(anchor_features)
+        entry = weights[0]
+        if shared.device.type == "cpu" and shared.dtype == residuals.dtype == torch.float32:
+            return KernelMLP.apply(shared, residuals, anchor_index, *weights)
+        first = torch.addmm(shared.index_select(0, anchor_index), residuals, entry)  # float16 under autocast
+        x = nn.functional.leaky_relu(first[:, : self.width], NEGATIVE_SLOPE)
+        for block in self.blocks:
+            x = block(x)
+        return torch.addmm(first[:, self.width :], x, self.output_weight)
+
+    def begin(self, anchor_features: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """The anchors' part of the first layer and of the skip, biases included [A, width + outputs]; other weights: of
+        the residual [residual_dim, width + outputs], four of each block, of the output.
+        """
+        anchor_entry, entry, bias = self._entry()
+        return linear(anchor_features, anchor_entry, bias), self._after_entry(entry)
+
+    def arrays(self) -> MLPArrays:
+        """The weights as the kernels take them; without gradient."""
+        tensors = {name: p.detach().cpu().numpy() for name, p in self.named_parameters()}
+        return MLPArrays.of(tensors, self.anchor_dim)
+
+    def _entry(self) -> tuple[Tensor, Tensor, Tensor]:
+        """First layer and skip side by side: of the anchor, of the residual [inputs, width + outputs]; bias."""
+        entry = torch.cat([self.input_weight, self.skip_weight], 1)
+        bias = torch.cat([self.input_bias, self.output_bias])
+        return entry[: self.anchor_dim], entry[self.anchor_dim :], bias
+
+    def _after_entry(self, entry: Tensor) -> list[Tensor]:
+        return [entry, *(p for block in self.blocks for p in block.parameters()), self.output_weight]

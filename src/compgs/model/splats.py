@@ -13,10 +13,8 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
+from compgs.model.constants import CUTOFF_SIGMAS
 from compgs.model.spherical_harmonics import coefficients, view_colors
-
-# An opaque splat falls below 1/255 at sqrt(2 ln 255) = 3.33 standard deviations.
-CUTOFF_SIGMAS = 3.34
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +76,8 @@ class SplatModel:
 
     splats: Splats
     background: tuple[float, float, float]  # RGB, 0 to 1
-    world_offset: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # world units, float64: origin of the local frame
+    # world units, float64: origin of the local frame
+    world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def counts(self) -> Mapping[str, int]:

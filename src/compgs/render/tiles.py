@@ -20,6 +20,7 @@ variables (rather than in the buffer) spare the compiled code a check for overla
 import numpy as np
 from numba import njit, prange
 
+from compgs.numerics.vector_sums import add_in_any_order
 from compgs.render.binning import (
     CHUNKS,
     EXP2_SCALE,
@@ -30,7 +31,6 @@ from compgs.render.binning import (
     tile_at,
     turns,
 )
-from compgs.vector_sums import add_in_any_order
 
 FASTMATH = {"contract", "nsz", "arcp", "nnan", "ninf"}
 f32 = np.float32

@@ -6,7 +6,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
-from compgs.rotations import rigid, rotation_from_quaternion
+from compgs.numerics.rotations import rigid, rotation_from_quaternion
 from compgs.scene.capture import Capture, PosedImage, check_camera, usable_positions
 from compgs.scene.colmap import UNDISTORT_COMMAND, ColmapCamera, ColmapImage, read_sparse_model
 from compgs.scene.undistort import MODELS, Distortion

@@ -12,7 +12,7 @@ from PIL import Image
 
 from compgs.cameras import Camera
 from compgs.errors import ConfigError, OutputError
-from compgs.rotations import quaternion_from_rotation, rigid
+from compgs.numerics.rotations import quaternion_from_rotation, rigid
 from compgs.scene import ray_tracing as rt
 from compgs.scene.colmap import ColmapCamera, ColmapImage, ColmapPoints
 from compgs.scene.colmap_writer import write_sparse_model

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
 from typing import TypeVar
@@ -14,6 +14,7 @@ from PIL import Image
 from compgs.cameras import Camera
 from compgs.errors import ConfigError, SceneError, UnreadableImage, UnsupportedCamera
 from compgs.scene.capture import PosedImage
+from compgs.scene.image_cache import ImageCache
 from compgs.scene.undistort import sample_bicubic, undistorted_camera, undistortion_map
 from compgs.scene.views import View
 
@@ -44,8 +45,14 @@ def load_views(
     downscale: int,
     background: tuple[float, float, float],
     progress: Progress | None = None,
+    cache: ImageCache | None = None,
 ) -> list[View]:
-    """The views at 1 / downscale of their images' size, in the given order. Everything is checked."""
+    """The views at 1 / downscale of their images' size, in the given order.
+
+    Headers, sizes and cameras are checked. Images that all fit into the cache are decoded at once, and so checked; of a
+    larger capture each is decoded when its view is looked at.
+    """
+    cache = cache or ImageCache()
     cameras = _checked_cameras(images)
     for posed, camera in zip(images, cameras, strict=True):
         width, height = downscaled_size((camera.width, camera.height), downscale)
@@ -56,18 +63,44 @@ def load_views(
             )
     maps = _Maps()
 
-    def load(index: int) -> View:
+    def undistorted(index: int) -> tuple[Camera, np.ndarray | None]:
+        """The camera of the undistorted image, and where its pixels are in the photograph."""
         posed, camera = images[index], cameras[index]
-        pixels = read_image(posed.path, background)
-        if posed.distortion is not None and not posed.distortion.is_identity:
-            camera, positions = maps.get(replace(posed, camera=camera))
+        if posed.distortion is None or posed.distortion.is_identity:
+            return camera, None
+        return maps.get(replace(posed, camera=camera))
+
+    def read(index: int) -> np.ndarray:
+        pixels = read_image(images[index].path, background)
+        camera, positions = undistorted(index)
+        if positions is not None:
             pixels = sample_bicubic(pixels, positions)
         width, height = downscaled_size((camera.width, camera.height), downscale)
         if (width, height) != (camera.width, camera.height):
             pixels = np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
-        return View(posed.name, camera.resized(width, height), np.ascontiguousarray(pixels))
+        return np.ascontiguousarray(pixels)
 
-    return _in_threads(load, len(images), progress)
+    def view(index: int) -> View:
+        camera, _ = undistorted(index)
+        width, height = downscaled_size((camera.width, camera.height), downscale)
+        return View(images[index].name, camera.resized(width, height), _Stored(cache, index, read))
+
+    views = _in_threads(view, len(images), None)
+    if sum(3 * view.camera.width * view.camera.height for view in views) <= cache.most_bytes:
+        _in_threads(lambda index: views[index].image.shape, len(images), progress)
+    return views
+
+
+@dataclass(frozen=True, eq=False)
+class _Stored:
+    """An image of a cache, read when it is wanted."""
+
+    cache: ImageCache
+    index: int
+    read: Callable[[int], np.ndarray]
+
+    def __call__(self) -> np.ndarray:
+        return self.cache.get(self.index, lambda: self.read(self.index))
 
 
 def downscaled_size(size: tuple[int, int], downscale: int) -> tuple[int, int]:

@@ -53,7 +53,7 @@ def colors_at(points: Points, positions: np.ndarray) -> np.ndarray:
 def median_spacing(positions: np.ndarray) -> float:  # positions: [P, 3] world units
     """The median distance of a point to its nearest neighbour; copies of a point count as one. World units.
 
-    The median does not mind outliers, far background or dense clusters of less than half of the points.
+    The median is not moved by outliers, far background or dense clusters of less than half of the points.
     """
     unique = np.unique(positions, axis=0)
     if len(unique) < 2:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from compgs.errors import SceneError, UnsupportedCamera
-from compgs.rotations import nearest_rotation, rigid
+from compgs.numerics.rotations import nearest_rotation, rigid
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".webp")
 

@@ -1,5 +1,6 @@
 """What was captured: views (image + camera), points, and the scene that holds them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,14 @@ class View:
 
     name: str  # relative to the folder of the images, "/" between its parts
     camera: Camera
-    image: np.ndarray  # [H, W, 3] uint8, display RGB, undistorted
+    pixels: (
+        np.ndarray | Callable[[], np.ndarray]
+    )  # [H, W, 3] uint8, display RGB, undistorted; or what reads them
+
+    @property
+    def image(self) -> np.ndarray:
+        """[H, W, 3] uint8, display RGB, undistorted; perhaps read only now. Raises UnreadableImage."""
+        return self.pixels if isinstance(self.pixels, np.ndarray) else self.pixels()
 
 
 @dataclass(frozen=True, eq=False)

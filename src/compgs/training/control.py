@@ -1,4 +1,4 @@
-"""Adaptive control of the anchors: growth where the image still pulls, pruning where nothing is seen.
+"""Adaptive control of the anchors: growth where the image's gradient is large, pruning of what nobody sees.
 
 The paper leaves it to Scaffold-GS (Lu et al. 2023): coupled primitives whose 2D means keep a large gradient ask for new
 anchors on three grids of 16, 4 and 1 voxels; anchors whose primitives are transparent are removed.
@@ -28,8 +28,8 @@ from compgs.training.optimizers import replace_rows
 
 # (gradient threshold factor, grid size in voxels), coarse first
 GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
-# lambda at which settings of growth and pruning are meant as they are given, and the range in which they follow it:
-# below 1e-6 more anchors took half as many bytes again and brought nothing (docs/results/experiments.md, fifth series)
+# lambda for which the settings of growth and pruning are given, and the range in which they follow lambda:
+# below 1e-6 more anchors took half as many bytes again and brought nothing (docs/results/decisions.md)
 USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 COORDINATE_LIMIT = 1 << 20  # voxels: what the octree coder can hold
 # Steps: with fewer views than that, passes are counted as if there were as many, or control would come every few steps.
@@ -210,7 +210,7 @@ class AdaptiveControl:
 
 def new_cells(
     target: Tensor,  # [C, 3] int64 voxels, where candidates are
-    gradient: Tensor,  # [C] how much the image pulls at them
+    gradient: Tensor,  # [C] mean gradient of their primitives
     taken: Tensor,  # [N, 3] int64 voxels, anchors that there are
     size: int,  # voxels to a cell of the grid
     room: int,  # new anchors that are allowed

@@ -8,11 +8,11 @@ model, begins with a linear layer. So for any orthonormal U
 
 is the same scene, with rounding errors of the same size. Of all U the principal axes of the references (the
 Karhunen-Loeve transform; Goyal 2001, "Theoretical foundations of transform coding") leave Gaussian channels the least
-bits, and the file needs nothing new: the weights that it holds anyway absorb U. Anchors still move and come, so that it
-is done several times in a run.
+bits, and the file needs nothing new: the weights that it holds anyway absorb U. References change and anchors are added
+while training goes on, so this is done several times in a run.
 
-Adam moves all channels alike. Where the first axes hold most of what there is to say, and the last ones hardly leave
-zero, those would learn too slowly and these wander for nothing: learning rates follow the spread of the channels.
+Adam moves all channels alike. But the first axes hold most of the information and would learn too slowly, while the
+last ones hardly leave zero and would only wander. So the learning rates follow the spread of the channels.
 """
 
 from collections.abc import Iterator
@@ -22,12 +22,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.linear import transposed_product
+from compgs.numerics.linear import transposed_product
 from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import replace_parameter
 
 # Learning rate of a channel that spreads over one step; it goes with the root of the spread, down to the second number.
-# Rates a seventh higher and lower came out alike (docs/results/experiments.md, sixth series).
+# Rates a seventh higher and lower came out alike (docs/results/decisions.md).
 RATE_OF_ONE, SMALLEST_RATE = 1.75, 0.6
 # Spread in steps below which a channel is dropped: one symbol in ten is other than zero there; 0.25 and 0.35 came out
 # alike.
@@ -58,7 +58,7 @@ def channel_rates(references: Tensor) -> Tensor:
 
 @torch.no_grad()
 def decorrelate(model: TrainedModel, optimizer: torch.optim.Optimizer) -> None:
-    """Turn the references into their principal axes, and with them all that reads them and Adam's moments."""
+    """Turn the references into their principal axes, and the layers that read them and Adam's moments accordingly."""
     axes = principal_axes(model.references)
     for parameter, dimension, first in _along_references(model):
         _turn(parameter.data, dimension, first, axes)
@@ -107,7 +107,7 @@ def keep_channels(
         change = partial(_narrowed, dimension=dimension, first=first, kept=entries)
         replace_parameter(model, optimizer, parameter, change)
     network.keep_channels(kept)
-    for head in model.heads.networks():
+    for _, head in model.heads.networks():
         head.anchor_dim -= len(kept) - model.reference_dim
 
 

@@ -1,8 +1,8 @@
 """Adaptive density control of plain 3DGS (Kerbl et al. 2023, Sec. 5.2): clone, split, prune, reset opacities.
 
-Where the image still pulls at a splat's 2D mean, small splats are cloned and large ones split in two; transparent
-splats are removed, and after the first reset of the opacities also those that are too large for the scene. (The
-published program also removes what is large in the image; gsplat by default does not, and neither do we.)
+Where the loss has a large gradient by a splat's 2D mean, small splats are cloned and large ones split in two;
+transparent splats are removed, and after the first reset of the opacities also those that are too large for the scene.
+(The published program also removes what is large in the image; gsplat by default does not, and neither do we.)
 
 The published schedule counts steps of a run of 30 000. As mere fractions of a short run, it would judge splats that no
 view has shown since, or that have had no time to part from their clones, and reset opacities faster than they recover.
@@ -45,7 +45,7 @@ class DensifySchedule:
         return self.start <= step < self.stop and (step - self.start) % self.every == 0
 
     def reset_due(self, step: int) -> bool:
-        """Not so late that opacities would not be back before densification ends."""
+        """Whether opacities are reset after this step; never too late for them to recover before densification ends."""
         last = self.stop - self.reset_every // 2
         return 0 < step <= last and step % self.reset_every == 0
 
@@ -64,7 +64,7 @@ def densify_schedule(config: SplatConfig, steps: int, views: int) -> DensifySche
 
 
 class DensityControl:
-    """How much the image pulls at each splat since densities were last controlled, and what follows from it."""
+    """Gradients of the splats since density was last controlled, and what follows from them."""
 
     def __init__(
         self,

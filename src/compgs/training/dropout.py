@@ -2,7 +2,7 @@
 
 Where few views look, a handful of primitives in front of each camera can explain its photograph and be wrong from
 everywhere else. Whatever must do without some of its neighbours now and then cannot rely on such a trick. With many
-views there is nothing to gain (docs/results/experiments.md, fourth series).
+views there is nothing to gain (docs/results/decisions.md).
 """
 
 from collections.abc import Callable
@@ -19,14 +19,12 @@ HIGHEST_OPACITY = 0.9999  # of those that make up for the others
 
 
 def share_left_out(views: int, most: float) -> float:
-    """Of the primitives of a step, for a number of training views: `most` where they are few, nothing where they are
-    many.
-    """
+    """Share of the primitives that a step leaves out: `most` where training views are few, 0 where they are many."""
     return most * min(1.0, max(0.0, 2.0 - views / FEW_VIEWS))
 
 
 def thinned(prediction: Prediction, share: float, noise: Callable[[Tensor], Tensor]) -> Gaussians:
-    """The `share` of the primitives without opacity, and the others with as much more of it.
+    """The Gaussians, a random `share` of them with opacity 0, the others with more, so that the mean stays.
 
     `noise`: uniform in [-0.5, 0.5), of the shape of what it is given: all coupled primitives, so that chance does not
     depend on which of them were predicted at all.

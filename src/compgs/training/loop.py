@@ -19,6 +19,7 @@ from compgs.training.allocation import freed_memory_kept
 from compgs.training.checkpoint import CHECKPOINT_NAME
 
 REPORT_EVERY = 10  # steps between two status reports
+KEPT_BYTES = 8 << 30  # of photographs on a GPU, 3 bytes a pixel
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it may look at every primitive
 
 
@@ -41,7 +42,7 @@ class TrainingStatus:
 
 @dataclass(frozen=True)
 class StepResult:
-    loss: Tensor  # []; a number only when somebody reads it: a GPU is not waited for
+    loss: Tensor  # []; a tensor, so that the CPU waits for the GPU only when somebody reads it
     image: Tensor  # [H, W, 3]
     view: View
 
@@ -99,9 +100,16 @@ def checkpoint_path(output: str | Path | None, *, resume: bool) -> Path | None:
 def kept_target(
     targets: dict[int, Target], view_index: int, views: Sequence[View], device: torch.device
 ) -> Target:
-    """The photograph of a view; each goes to the device once and stays there."""
+    """The photograph of a view. On the CPU it shares the memory of the view's image, which the scene keeps or reads
+    again; it is copied to a GPU once and kept there while there is room.
+    """
+    if device.type == "cpu":
+        return Target.from_image(views[view_index].image)
     if view_index not in targets:
-        targets[view_index] = Target.from_image(views[view_index].image, device)
+        target = Target.from_image(views[view_index].image, device)
+        while targets and sum(t.image.numel() for t in targets.values()) + target.image.numel() > KEPT_BYTES:
+            del targets[next(iter(targets))]
+        targets[view_index] = target
     return targets[view_index]
 
 
@@ -113,7 +121,7 @@ def next_view(order: list[int], views: int, shuffle: np.random.Generator) -> int
 
 
 def diverged(step: int, what: str, value: float) -> TrainingError:
-    """For a value that is not finite any more."""
+    """The error to raise for a value that is not finite any more."""
     return TrainingError(f"step {step}: the {what} is {value}; try a lower learning rate or another seed")
 
 
@@ -126,14 +134,14 @@ class Pace:
         self._steps = 0
 
     def step(self) -> None:
-        """A step is done."""
+        """Count a step."""
         if self._since is None:
             self._since = time.perf_counter()
         else:
             self._steps += 1
 
     def look(self) -> float:
-        """Smoothed, but not for long: kernels that are compiled later on say nothing of the rest either."""
+        """Seconds per step, smoothed; the mean is forgotten when steps become twice as fast, as after compiling."""
         now = time.perf_counter()
         if self._since is not None and self._steps:
             recent = (now - self._since) / self._steps
@@ -143,7 +151,7 @@ class Pace:
         return self.seconds
 
     def pause(self, seconds: float) -> None:
-        """Something else than steps took so long."""
+        """Leave out seconds that were spent on something else than steps."""
         if self._since is not None:
             self._since += seconds
 

@@ -32,14 +32,15 @@ def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.A
         group("residuals", [model.residuals], config.embedding_lr),
         group("entropy", entropy.parameters(), entropy_lr),
     ]
-    if heads.layout == "paired":
-        groups.append(group("geometry", heads.geometry.parameters(), config.covariance_lr))
-        groups.append(group("appearance", heads.appearance.parameters(), config.color_lr))
-    else:
-        groups.append(group("translation", heads.translation.parameters(), config.translation_lr))
-        groups.append(group("covariance", heads.covariance.parameters(), config.covariance_lr))
-        groups.append(group("opacity", heads.opacity.parameters(), config.opacity_lr))
-        groups.append(group("color", heads.color.parameters(), config.color_lr))
+    head_rates = {
+        "geometry": config.covariance_lr,
+        "appearance": config.color_lr,
+        "translation": config.translation_lr,
+        "covariance": config.covariance_lr,
+        "opacity": config.opacity_lr,
+        "color": config.color_lr,
+    }
+    groups += [group(name, network.parameters(), head_rates[name]) for name, network in heads.networks()]
     return torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
 
 

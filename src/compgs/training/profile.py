@@ -1,21 +1,28 @@
 """Where a training step's time goes (`compgs train --profile`).
 
-The step is one autograd graph. Its forward half is timed between calls of `lap`; its backward half between the moments
-at which gradients reach the tensors that connect the parts: autograd walks back from the loss through rasterization,
+A trainer's step is a sequence of its methods; a profile wraps them, so that the step itself knows nothing of it. The
+step is one autograd graph: its forward half is timed from method to method, its backward half between the moments at
+which gradients reach the tensors that connect the parts. Autograd walks back from the loss through rasterization,
 projection and prediction to the entropy model, one after the other.
 """
 
+import functools
 import time
 from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 WARM_UP = 20  # steps that are not counted: kernels are compiled or loaded
 
+# What a step's tensors are, when the backward pass begins: each part's name, and where its gradients arrive.
+Stations = Callable[..., Iterable[tuple[str, tuple[Tensor, ...]]]]
+
 
 class StepProfile:
-    """Seconds by part, summed over steps. `begin` and `end` frame a step."""
+    """Seconds by part, summed over steps."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
@@ -23,17 +30,51 @@ class StepProfile:
         self._seen = 0
         self._last = 0.0
 
-    def begin(self) -> None:
-        self._last = self._now()
+    def watch(self, trainer: Any, parts: Mapping[str, str], stations: Stations) -> None:
+        """Wrap a trainer's methods: `parts` names what each of them is; `train_step` is the whole, `backward` the
+        backward pass, whose arguments `stations` takes.
+        """
+        for method, part in parts.items():
+            setattr(trainer, method, self._timed(getattr(trainer, method), part))
+        backward, step = trainer.backward, trainer.train_step
 
-    def lap(self, part: str) -> None:
+        @functools.wraps(backward)
+        def watched_backward(*arguments: Any) -> Any:
+            for part, tensors in stations(*arguments):
+                self._lap_on_gradient(part, tensors)
+            return backward(*arguments)
+
+        @functools.wraps(step)
+        def watched_step() -> Any:
+            self._last = self._now()
+            result = step()
+            self._seen += 1
+            self.steps += self._seen > WARM_UP
+            return result
+
+        trainer.backward, trainer.train_step = watched_backward, watched_step
+
+    def milliseconds(self) -> dict[str, float]:
+        """Per step, by part, in the order in which the parts come."""
+        return {part: 1e3 * seconds / max(1, self.steps) for part, seconds in self.seconds.items()}
+
+    def _timed(self, method: Callable[..., Any], part: str) -> Callable[..., Any]:
+        @functools.wraps(method)
+        def timed(*arguments: Any, **named: Any) -> Any:
+            result = method(*arguments, **named)
+            self._lap(part)
+            return result
+
+        return timed
+
+    def _lap(self, part: str) -> None:
         """What happened since the last lap was `part`."""
         now = self._now()
         if self._seen >= WARM_UP:
             self.seconds[part] += now - self._last
         self._last = now
 
-    def lap_on_gradient(self, part: str, *tensors: Tensor) -> None:
+    def _lap_on_gradient(self, part: str, tensors: Iterable[Tensor]) -> None:
         """When the gradients of all the tensors are there, what happened since the last lap was `part`."""
         waiting = [t for t in tensors if t.requires_grad]
         missing = len(waiting)
@@ -42,33 +83,13 @@ class StepProfile:
             nonlocal missing
             missing -= 1
             if missing == 0:
-                self.lap(part)
+                self._lap(part)
 
         for tensor in waiting:
             tensor.register_hook(arrived)
-
-    def end(self) -> None:
-        self._seen += 1
-        self.steps += self._seen > WARM_UP
-
-    def milliseconds(self) -> dict[str, float]:
-        """Per step, by part, in the order in which the parts come."""
-        return {part: 1e3 * seconds / max(1, self.steps) for part, seconds in self.seconds.items()}
 
     @staticmethod
     def _now() -> float:
         if torch.cuda.is_available():
             torch.cuda.synchronize()
         return time.perf_counter()
-
-
-class NoProfile(StepProfile):
-    """Measures nothing and waits for nothing."""
-
-    def begin(self) -> None: ...
-
-    def lap(self, part: str) -> None: ...
-
-    def lap_on_gradient(self, part: str, *tensors: Tensor) -> None: ...
-
-    def end(self) -> None: ...

@@ -13,34 +13,35 @@ import math
 from dataclasses import dataclass, replace
 
 LOWEST, HIGHEST = 1e-6, 1.0  # of lambda; below, growth does not follow it any more (control.LAMBDA_RANGE)
-LOOKS = 100  # at the size in a run: a look costs about as much as a training step
-FIRST_LOOK = (
-    0.1  # of the run after the rate has joined the loss: the entropy networks begin by knowing nothing
-)
-GROWING = 0.2  # integral gain of a look while anchors grow
+LOOKS = 100  # estimates of the size in a run; each costs about as much as a training step
+# Of the run, after the rate has joined the loss: the entropy networks begin by knowing nothing.
+FIRST_LOOK = 0.1
+GROWING = 0.2  # integral gain of an estimate while anchors grow
 SHRINKS = 0.1  # log of the share by which a file shrinks after growth at one lambda (plush_480, 2 000 steps)
 SETTLING = (2.0, 15.0)  # integral and proportional gain after growth
 SLOW_FROM = 0.92  # of the run: from here on the integral gain falls to zero at the end
-LARGEST_STEP = math.log(1.6)  # of log lambda in one look
+LARGEST_STEP = math.log(1.6)  # of log lambda at one estimate
 
 
 @dataclass(frozen=True)
 class RateState:
-    """What the control remembers between two looks."""
+    """What the control remembers between two estimates of the size."""
 
     lmbda: float
-    error: float | None = None  # log(size / target) at the last look after growth; None before the first
-    share: float = 1.0  # of today's bytes that stay when what adds least has been removed
+    error: float | None = None  # log(size / target) at the last estimate after growth; None before the first
+    share: float = 1.0  # of the present bytes that later pruning will leave
 
 
 def due(step: int, steps: int, rate_start: float) -> bool:
-    """The size is looked at after this step; `rate_start`: of the run before the rate joins the loss."""
+    """Whether the size is estimated after this step. `rate_start`: share of the run before the rate joins the loss."""
     return step % max(1, steps // LOOKS) == 0 and step >= (rate_start + FIRST_LOOK) * steps
 
 
 def follow(state: RateState, size: float, target: float, *, progress: float, grown: bool) -> RateState:
-    """The state after a look: `size` and `target` in bytes without what is fixed, both above 0; `progress` 0 to 1 of
-    the run; `grown` once no anchors are added any more.
+    """The state after an estimate of the size.
+
+    `size` and `target`: bytes without those that lambda cannot change, both above 0. `progress`: of the run, 0 to 1.
+    `grown`: no anchors are added any more.
     """
     error = math.log(size / target)
     if not grown:

@@ -7,17 +7,20 @@ quantization, no rate.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
 from compgs.errors import ConfigError
+from compgs.gaussians import Gaussians
 from compgs.losses import Target, photometric_loss
 from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
-from compgs.render import RasterSettings, rasterize, visible_mask
+from compgs.render import RasterResult, RasterSettings, rasterize, visible_mask
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
@@ -41,7 +44,7 @@ from compgs.training.loop import (
     run_to_end,
 )
 from compgs.training.optimizers import exponential_decay, set_learning_rates
-from compgs.training.profile import NoProfile, StepProfile
+from compgs.training.profile import StepProfile
 from compgs.training.seen_points import check_points_seen
 from compgs.training.splat_parameters import (
     SplatParameters,
@@ -80,7 +83,8 @@ def train_splats(
         trainer = SplatTrainer.resumed(scene, path, config, chosen)
     else:
         trainer = SplatTrainer(scene, config, chosen)
-    trainer.profile = profile or trainer.profile
+    if profile is not None:
+        profile.watch(trainer, PARTS, stations)
     trainer.run(path, on_progress)
     return SplatModel(trainer.parameters.trained(), scene.background, trainer.world_offset)
 
@@ -89,7 +93,7 @@ class SplatTrainer:
     """State of a run: splats, optimizer, density control, and the order in which views come."""
 
     kind = "splats"
-    lmbda = None  # nothing is weighed against the size
+    lmbda = None  # no rate in the loss
 
     def __init__(
         self,
@@ -115,7 +119,6 @@ class SplatTrainer:
         self.targets: dict[int, Target] = {}
         self.settings = RasterSettings(background=scene.background)
         self.step = 0
-        self.profile: StepProfile = NoProfile()
 
     @property
     def primitives(self) -> int:
@@ -131,41 +134,47 @@ class SplatTrainer:
 
     def train_step(self) -> StepResult:
         """Activate, rasterize, compare, pull; then control density."""
-        view_index = next_view(self.order, len(self.scene.train_views), self.shuffle)
-        view = self.scene.train_views[view_index]
+        index = next_view(self.order, len(self.scene.train_views), self.shuffle)
+        view = self.scene.train_views[index]
         splats = self.parameters.splats()
-        gathers = self.schedule.active(self.step)
-        profile = self.profile
-        profile.begin()
+        gaussians = self.activate(splats, self.inside(splats, view.camera), view.camera)
+        rendered = self.rasterize(gaussians, view.camera)
+        loss = self.compare(rendered, self.target(index))
+        self.backward(loss, rendered, gaussians)
+        self.update()
+        self.observe(rendered, view.camera)
+        self.step += 1
+        self.control_density()
+        return StepResult(loss.detach(), rendered.image.detach(), view)
 
-        inside = visible_mask(splats.means.detach(), splat_radii(splats), view.camera, self.settings)
-        profile.lap("culling")
-        gaussians = splat_gaussians(splats, view.camera, self.degree(), inside)
-        profile.lap("activation and harmonics")
-        rendered = rasterize(gaussians, view.camera, self.settings)
-        profile.lap("projection and rasterization")
-        if gathers:
+    def inside(self, splats: Splats, camera: Camera) -> Tensor:
+        """[M] bool: splats that may be in the image."""
+        return visible_mask(splats.means.detach(), splat_radii(splats), camera, self.settings)
+
+    def activate(self, splats: Splats, inside: Tensor, camera: Camera) -> Gaussians:
+        return splat_gaussians(splats, camera, self.degree(), inside)
+
+    def rasterize(self, gaussians: Gaussians, camera: Camera) -> RasterResult:
+        rendered = rasterize(gaussians, camera, self.settings)
+        if self.schedule.active(self.step):
             rendered.means2d.retain_grad()
-        loss = photometric_loss(rendered.image, self.target(view_index), self.config.training.ssim_weight)
-        profile.lap("loss")
-        profile.lap_on_gradient("loss, backward", rendered.image)
-        profile.lap_on_gradient("rasterization, backward", rendered.means2d)
-        # Autograd goes back in the opposite order: through the projection, then through the harmonics.
-        profile.lap_on_gradient("projection, backward", gaussians.colors)
-        loss.backward()
-        profile.lap("activation and harmonics, backward")
+        return rendered
 
+    def compare(self, rendered: RasterResult, target: Target) -> Tensor:
+        return photometric_loss(rendered.image, target, self.config.training.ssim_weight)
+
+    def backward(self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians) -> None:
+        """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
+        loss.backward()
+
+    def update(self) -> None:
         set_learning_rates(self.optimizer, self.step / self.config.training.steps, exponential_decay)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        profile.lap("optimizer")
-        if gathers and rendered.means2d.grad is not None:
-            self.control.observe(rendered.means2d.grad, rendered.visible, view.camera)
-        self.step += 1
-        self.control_density()
-        profile.lap("density control")
-        profile.end()
-        return StepResult(loss.detach(), rendered.image.detach(), view)
+
+    def observe(self, rendered: RasterResult, camera: Camera) -> None:
+        if self.schedule.active(self.step) and rendered.means2d.grad is not None:
+            self.control.observe(rendered.means2d.grad, rendered.visible, camera)
 
     def control_density(self) -> None:
         """What the schedule asks for after so many steps."""
@@ -190,7 +199,7 @@ class SplatTrainer:
         run_to_end(self, self.config.training, path, on_progress)
 
     def estimated_bytes(self) -> int:
-        """Of the .ply file, were it written now: its size without the header."""
+        """Size of the .ply file if it were written now, without its header."""
         return 4 * len(self.parameters) * (STORED_NUMBERS + self.parameters.rest[0].numel())
 
     def finish(self) -> None:
@@ -232,3 +241,24 @@ class SplatTrainer:
         trainer.order = state["order"]
         trainer.step = state["step"]
         return trainer
+
+
+# What a profile calls the parts of a step.
+PARTS = {
+    "inside": "culling",
+    "activate": "activation and harmonics",
+    "rasterize": "projection and rasterization",
+    "compare": "loss",
+    "backward": "activation and harmonics, backward",
+    "update": "optimizer",
+    "control_density": "density control",
+}
+
+
+def stations(
+    loss: Tensor, rendered: RasterResult, gaussians: Gaussians
+) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
+    """Where the gradients of a step arrive. Autograd goes back through the projection, then through the harmonics."""
+    yield "loss, backward", (rendered.image,)
+    yield "rasterization, backward", (rendered.means2d,)
+    yield "projection, backward", (gaussians.colors,)

@@ -1,0 +1,126 @@
+"""A way through a scene along cameras that it was captured from: where they stood there is something to see."""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from compgs.cameras import Camera
+from compgs.errors import UnsupportedCamera
+from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
+
+# Of the tour's other legs' median: a longer leg leads through what nobody has seen, and is left out.
+LONGEST_LEG = 3.0
+TURNING = 1.0  # spreads of the positions that a change of direction by one (of unit vectors) counts as
+
+
+def tour(
+    cameras: Sequence[Camera],  # at least 2, in any order
+    *,
+    frames: int,
+    width: int,
+    height: int,
+) -> list[tuple[str, Camera]]:
+    """`frames` cameras on a smooth way along the given ones, with the first one's field of view across.
+
+    The shortest round tour (nearest neighbours, then 2-opt), without its longest leg where that is much longer than
+    the others. Positions by centripetal Catmull-Rom splines, rotations by spherical interpolation; equal pace.
+    Raises UnsupportedCamera for fewer than two cameras.
+    """
+    if len(cameras) < 2:
+        raise UnsupportedCamera(f"a way along cameras needs two of them, found {len(cameras)}")
+    order, closed = tour_order(cameras)
+    chosen = [cameras[i] for i in order]
+    centers = np.stack([camera.center for camera in chosen])
+    rotations = _same_side(np.stack([quaternion_from_rotation(camera.rotation) for camera in chosen]))
+    if closed:
+        centers = np.concatenate([centers, centers[:1]])
+        rotations = _same_side(np.concatenate([rotations, rotations[:1]]))
+    legs = np.maximum(np.linalg.norm(np.diff(centers, axis=0), axis=1), 1e-9 * max(np.ptp(centers), 1e-30))
+    knots = np.concatenate([[0.0], np.cumsum(legs)])
+    times = np.linspace(0.0, knots[-1], frames + 1)[:-1] if closed else np.linspace(0.0, knots[-1], frames)
+    first = cameras[0]
+    focal = first.fx * width / first.width
+    result = []
+    for i, time in enumerate(times):
+        leg = min(int(np.searchsorted(knots, time, side="right")) - 1, len(legs) - 1)
+        part = (time - knots[leg]) / legs[leg]
+        center = _between(centers, leg, part, closed)
+        rotation = rotation_from_quaternion(_slerp(rotations[leg], rotations[leg + 1], part))
+        pose = rigid(rotation, -rotation @ center)
+        result.append((f"tour {i}", Camera(pose, focal, focal, width / 2, height / 2, width, height)))
+    return result
+
+
+def tour_order(cameras: Sequence[Camera]) -> tuple[list[int], bool]:
+    """Order of the cameras on their tour, and whether it is closed; an open one begins behind its longest leg."""
+    distance = _distances(cameras)
+    order = [0]
+    left = set(range(1, len(cameras)))
+    while left:
+        order.append(min(left, key=lambda i: (distance[order[-1], i], i)))
+        left.remove(order[-1])
+    order = _two_opt(order, distance)
+    legs = [distance[a, b] for a, b in zip(order, [*order[1:], order[0]], strict=True)]
+    longest = int(np.argmax(legs))
+    others = legs[:longest] + legs[longest + 1 :]
+    if len(cameras) > 2 and legs[longest] <= LONGEST_LEG * max(float(np.median(others)), 1e-30):
+        return order, True
+    return order[longest + 1 :] + order[: longest + 1], False
+
+
+def _distances(cameras: Sequence[Camera]) -> np.ndarray:
+    """[V, V]: of positions, in units of their spread, and of viewing directions."""
+    centers = np.stack([camera.center for camera in cameras])
+    centers = centers - centers.mean(0)
+    spread = max(float(np.sqrt((centers**2).sum(1).mean())), 1e-30)
+    places = np.concatenate([centers / spread, TURNING * np.stack([c.rotation[2] for c in cameras])], 1)
+    return np.linalg.norm(places[:, None] - places[None], axis=2)
+
+
+def _two_opt(order: list[int], distance: np.ndarray) -> list[int]:
+    """Turn pieces of a round tour around while that makes it shorter."""
+    better = True
+    while better:
+        better = False
+        for i in range(len(order) - 2):
+            for j in range(i + 2, len(order) - (i == 0)):
+                a, b, c, d = order[i], order[i + 1], order[j], order[(j + 1) % len(order)]
+                if distance[a, c] + distance[b, d] < distance[a, b] + distance[c, d] - 1e-12:
+                    order[i + 1 : j + 1] = order[i + 1 : j + 1][::-1]
+                    better = True
+    return order
+
+
+def _same_side(quaternions: np.ndarray) -> np.ndarray:
+    """q and -q are one rotation: each is taken near to the one before."""
+    result = quaternions.copy()
+    for i in range(1, len(result)):
+        if result[i] @ result[i - 1] < 0:
+            result[i] = -result[i]
+    return result
+
+
+def _slerp(a: np.ndarray, b: np.ndarray, part: float) -> np.ndarray:
+    angle = float(np.arccos(np.clip(a @ b, -1.0, 1.0)))
+    if angle < 1e-6:
+        return a + part * (b - a)
+    return (np.sin((1 - part) * angle) * a + np.sin(part * angle) * b) / np.sin(angle)
+
+
+def _between(points: np.ndarray, leg: int, part: float, closed: bool) -> np.ndarray:
+    """On the spline through the points, `part` of the way from one to the next (Barry and Goldman 1988)."""
+    n = len(points) - 1
+    before = points[(leg - 1) % n] if closed else points[max(leg - 1, 0)]
+    after = points[(leg + 2) % n] if closed else points[min(leg + 2, n)]
+    p = [before, points[leg], points[leg + 1], after]
+    knots = [0.0]
+    for a, b in itertools.pairwise(p):
+        knots.append(knots[-1] + max(float(np.linalg.norm(b - a)) ** 0.5, 1e-12))
+    t = knots[1] + part * (knots[2] - knots[1])
+    for level in range(1, 4):
+        p = [
+            ((knots[i + level] - t) * p[i] + (t - knots[i]) * p[i + 1]) / (knots[i + level] - knots[i])
+            for i in range(4 - level)
+        ]
+    return p[0]

@@ -1,0 +1,34 @@
+"""How exactly the file holds the networks' weights, decided once: training rounds to it, the encoder writes it."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from compgs.config import EntropyConfig
+from compgs.entropy.quantization import quantize_weight
+from compgs.model.constants import SHARED_RESIDUALS
+
+BIAS_BITS = 14  # biases are few: they keep more bits than the weights
+SHARED_RESIDUAL_BITS = 10  # residual embeddings that all anchors share are few, too
+
+
+@dataclass(frozen=True)
+class StoredWeights:
+    """Bits of a weight, sign included."""
+
+    network: int  # of entropy networks
+    head: int  # of prediction heads
+
+    @classmethod
+    def of(cls, config: EntropyConfig) -> "StoredWeights":
+        return cls(config.network_bits, config.head_bits)
+
+    def bits(self, name: str, tensor: Tensor) -> int:
+        """Of a tensor of the heads, by its name in the file."""
+        if name == SHARED_RESIDUALS:
+            return SHARED_RESIDUAL_BITS
+        return self.head if tensor.dim() > 1 else BIAS_BITS
+
+    def rounded(self, name: str, tensor: Tensor) -> Tensor:
+        """A tensor of the heads as the file will hold it, straight-through."""
+        return quantize_weight(tensor, self.bits(name, tensor))

@@ -1,0 +1,42 @@
+"""How large the file of a model would be, without writing it."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from compgs.entropy.network import FRACTION_BITS
+from compgs.entropy.quantization import weight_exponent
+from compgs.trained_model import TrainedModel
+
+POSITION_BITS = 10.0  # of an anchor's position, about
+OTHER_BYTES = 600  # names of tensors, scene, tables, metadata, container, about
+LENS_BYTES, VIEWPOINT_BYTES = 32, 13  # of the cameras that the file keeps
+
+
+def latent_bytes(model: TrainedModel) -> float:
+    """Bytes of latents and positions; not finite if the latents are not."""
+    anchors = int(model.mask.any(1).sum())
+    return (sum(model.estimated_bits().values()) + POSITION_BITS * anchors) / 8
+
+
+@torch.no_grad()
+def fixed_bytes(model: TrainedModel) -> int:
+    """Bytes of the networks and of all else that does not grow with the scene; no lambda makes them fewer."""
+    stored, bits = model.weights, 0.0
+    for name, tensor in model.head_tensors().items():
+        bits += gaussian_entropy(tensor * 2.0 ** weight_exponent(tensor, stored.bits(name, tensor)))
+    for network in model.entropy.coded_networks:
+        for weight, bias in network.layers():
+            scaled = weight * 2.0 ** weight_exponent(weight, stored.network)
+            # In halves, as the file has them: means and scales differ in spread.
+            bits += sum(gaussian_entropy(half) for half in scaled.tensor_split(2))
+            bits += sum(gaussian_entropy(half * 2.0**FRACTION_BITS) for half in bias.tensor_split(2))
+    kept = min(len(model.viewpoints), model.config.training.viewpoints)
+    return int(bits / 8) + OTHER_BYTES + (LENS_BYTES + VIEWPOINT_BYTES * kept if kept else 0)
+
+
+def gaussian_entropy(values: Tensor) -> float:
+    """Bits of values that are rounded to integers and coded as if from one Gaussian of their spread."""
+    variance = float(values.detach().double().var(correction=0)) + 1 / 12  # of the rounding
+    return values.numel() * max(0.0, 0.5 * math.log2(2 * math.pi * math.e * variance))

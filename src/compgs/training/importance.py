@@ -1,0 +1,65 @@
+"""What each coupled primitive adds to the training views, and which ones they would miss.
+
+A primitive's *contribution* is the sum of its blending weights (transmittance times alpha) over the pixels of the
+views: what it adds to them, whatever its color. Anchors that add least are pruned while the others can still make up
+for them, and what hardly adds anything is left out of the file.
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from compgs.cameras import Camera
+from compgs.model.prediction import Prediction
+from compgs.render import RasterSettings, contributions
+from compgs.scene.views import View
+
+# Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
+# up for an error. All views decide what the file leaves out at the end, since a primitive may matter to one alone.
+LOOKED_AT, PRUNED_BY = 48, 256
+
+
+def spread(views: Sequence[View], most: int) -> Sequence[View]:
+    """At most `most` of the views, evenly spread over their order."""
+    if len(views) <= most:
+        return views
+    return [views[i * len(views) // most] for i in range(most)]
+
+
+@torch.no_grad()
+def view_contributions(
+    views: Sequence[View],
+    predicted: Callable[[Camera], tuple[Tensor, Prediction] | None],
+    shape: tuple[int, int],  # N, K
+    settings: RasterSettings,
+    device: torch.device,
+) -> Tensor:  # [N, K] float64, pixels
+    """Contributions of all coupled primitives to the views.
+
+    `predicted`: for a camera, the visible anchors [V] and their prediction, or None if no anchor is visible.
+    """
+    total = torch.zeros(shape[0] * shape[1], dtype=torch.float64, device=device)
+    for view in views:
+        seen = predicted(view.camera)
+        if seen is None:
+            continue
+        rows, prediction = seen
+        slots = rows[prediction.index // shape[1]] * shape[1] + prediction.index % shape[1]
+        # Each slot comes once: no sum depends on an order.
+        total[slots] += contributions(prediction.gaussians, view.camera, settings).double()
+    return total.view(shape)
+
+
+def worth_keeping(contributions: Tensor, share: float) -> Tensor:
+    """[P] bool: all but the smallest contributions [P], which together make up at most `share` of the sum."""
+    ascending = contributions.sort(stable=True)
+    idle = ascending.values.cumsum(0) <= share * contributions.sum()
+    kept = contributions > 0
+    kept[ascending.indices[idle]] = False
+    return kept
+
+
+def missed(contributions: Tensor, idle_share: float) -> Tensor:
+    """[N, K] bool: coupled primitives that the views would miss, by their contributions [N, K]."""
+    return worth_keeping(contributions.view(-1), idle_share).view_as(contributions)

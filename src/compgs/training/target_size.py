@@ -1,0 +1,81 @@
+"""A file of the size that was asked for: lambda follows what the file would take (`rate_control`)."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+from torch import Tensor
+
+from compgs.config import Config
+from compgs.errors import ConfigError, TrainingError
+from compgs.trained_model import TrainedModel
+from compgs.training.control import ControlSchedule, rate_weight
+from compgs.training.file_size import fixed_bytes, latent_bytes
+from compgs.training.importance import missed, worth_keeping
+from compgs.training.rate_control import LOOKS, RateState, due, follow
+
+SHARES = 10  # times in a run that the effect of later pruning is predicted
+
+
+def pruned_share(config: Config, lmbda: float) -> float:
+    """Share of all blending weights that the anchors removed in one pruning may have together."""
+    return min(0.5, config.control.prune_share * rate_weight(config.control, lmbda))
+
+
+class TargetSize:
+    """Follows the size of a model in training. Raises ConfigError if its networks alone take more than the target."""
+
+    def __init__(
+        self,
+        model: TrainedModel,
+        schedule: ControlSchedule,
+        pruned_at: frozenset[int],
+        contributions: Callable[[], Tensor],  # [N, K] of the coupled primitives, to a sample of the views
+    ) -> None:
+        self.model = model
+        self.config = model.config
+        self.schedule = schedule
+        self.pruned_at = pruned_at
+        self.contributions = contributions
+        target, least = self.config.training.target_bytes, fixed_bytes(model)
+        if target is not None and target <= least:
+            raise ConfigError(
+                f"training.target_bytes = {target}: the networks alone take about {least} bytes; "
+                "ask for more, or make them smaller (model.width, model.coupled_primitives)"
+            )
+
+    def follow(self, state: RateState, step: int) -> RateState:
+        """The state after a step, with its new lambda; unchanged where no size is asked for.
+
+        Raises TrainingError if the latents are not finite any more.
+        """
+        t = self.config.training
+        if t.target_bytes is None or not due(step, t.steps, t.rate_start):
+            return state
+        grown = self.schedule.ended(step)
+        size, fixed = self.size(), fixed_bytes(self.model)
+        if not math.isfinite(size):
+            raise TrainingError(f"step {step}: the rate is {size}; try a lower learning rate or another seed")
+        pruned = any(step - t.steps // LOOKS <= at < step for at in self.pruned_at)
+        if pruned or step % max(1, t.steps // SHARES) == 0 or (grown and state.error is None):
+            state = replace(state, share=self.lasting_share(state.lmbda, step))
+        target = max(1, t.target_bytes - fixed)
+        return follow(state, size * state.share, target, progress=step / t.steps, grown=grown)
+
+    def size(self) -> float:
+        """Bytes of the file that depend on lambda: latents and positions, without the networks."""
+        bits = latent_bytes(self.model)
+        return math.floor(bits) if math.isfinite(bits) else bits
+
+    def lasting_share(self, lmbda: float, step: int) -> float:
+        """Predicted share of the bytes of `size` that is left at the end of the run, after the last pruning."""
+        model, size = self.model, self.size()
+        total = self.contributions()
+        still = sum(at >= step for at in self.pruned_at)
+        kept = worth_keeping(total.sum(1), 1.0 - (1.0 - pruned_share(self.config, lmbda)) ** still)
+        mask = model.mask
+        try:
+            model.mask = missed(total, self.config.control.idle_share) & kept[:, None]
+            return self.size() / size if model.mask.any() else 1.0
+        finally:
+            model.mask = mask

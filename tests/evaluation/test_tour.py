@@ -1,0 +1,67 @@
+"""A way along cameras: it passes all of them, smoothly, and looks where they look."""
+
+import numpy as np
+import pytest
+
+from compgs.cameras import Camera
+from compgs.errors import UnsupportedCamera
+from compgs.evaluation.camera_path import look_at
+from compgs.evaluation.tour import tour, tour_order
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def ring(angles: np.ndarray, radius: float = 3.0) -> list[Camera]:
+    """Cameras around the origin, which they look at."""
+    centers = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.ones_like(angles)], 1)
+    return [Camera(look_at(c, np.zeros(3), UP), 300.0, 300.0, 160.0, 120.0, 320, 240) for c in centers]
+
+
+def test_a_ring_in_any_order_is_gone_around_once() -> None:
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    shuffled = np.random.default_rng(3).permutation(12)
+    order, closed = tour_order(ring(angles[shuffled]))
+    steps = np.diff(shuffled[order], append=shuffled[order[0]]) % 12
+    assert closed and (len(set(steps.tolist())) == 1) and steps[0] in (1, 11)
+
+
+def test_frames_on_a_ring_keep_to_it_and_look_at_its_middle() -> None:
+    cameras = ring(np.linspace(0, 2 * np.pi, 12, endpoint=False))
+    views = tour(cameras, frames=60, width=640, height=480)
+    assert len(views) == 60
+    for _, camera in views:
+        assert abs(np.linalg.norm(camera.center[:2]) - 3.0) < 0.06
+        ahead = camera.rotation[2]
+        to_middle = -camera.center / np.linalg.norm(camera.center)
+        assert np.degrees(np.arccos(np.clip(ahead @ to_middle, -1, 1))) < 2.5
+        np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-9)
+        assert (camera.width, camera.height, camera.fx) == (640, 480, 600.0)
+    pace = np.linalg.norm(np.diff([c.center for _, c in views], axis=0), axis=1)
+    assert pace.max() < 1.3 * pace.min()
+
+
+def test_half_a_ring_is_not_closed_through_what_nobody_has_seen() -> None:
+    angles = np.linspace(0, np.pi, 9)
+    shuffled = np.random.default_rng(0).permutation(9)
+    order, closed = tour_order(ring(angles[shuffled]))
+    assert not closed and set(np.diff(shuffled[order]).tolist()) in ({1}, {-1})
+    views = tour(ring(angles), frames=20, width=320, height=240)
+    assert all(camera.center[1] > -0.1 for _, camera in views)
+    ends = {tuple(np.round(views[i][1].center, 6)) for i in (0, -1)}
+    assert ends == {tuple(np.round(ring(angles)[i].center, 6)) for i in (0, -1)}
+
+
+def test_two_cameras_and_cameras_in_one_place_have_a_way_too() -> None:
+    two = ring(np.array([0.0, 0.5]))
+    assert len(tour(two, frames=5, width=64, height=48)) == 5
+    turning = [
+        Camera(look_at(np.zeros(3), np.array([np.cos(a), np.sin(a), 0.0]), UP), 50, 50, 32, 24, 64, 48)
+        for a in (0.0, 0.4, 0.8)
+    ]
+    views = tour(turning, frames=7, width=64, height=48)
+    assert all(np.isfinite(camera.world_to_camera).all() for _, camera in views)
+
+
+def test_one_camera_is_no_way() -> None:
+    with pytest.raises(UnsupportedCamera, match="found 1"):
+        tour(ring(np.zeros(1)), frames=3, width=64, height=48)

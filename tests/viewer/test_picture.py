@@ -1,0 +1,84 @@
+"""The picture in the page is the renderer's: headless Chromium against compgs.render at the same cameras."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import compgs
+from compgs.cameras import Camera
+from compgs.codec.content import FileContent
+from compgs.codec.writer import write_content
+from compgs.viewer import html_page
+
+from .headless import visit
+
+ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "benchmarks"))
+from made_content import make_content, make_dimensions, paper_groups  # noqa: E402
+from made_heads import make_heads  # noqa: E402
+
+LEAST_DB = 35.0
+SHARED = make_dimensions(5, paper_groups(12, 0))
+SEPARATE = make_dimensions(4, paper_groups(8, 3), "separate", 16)
+CONTENTS = {
+    "paired": make_content(400, 3, SHARED),
+    "separate": make_content(400, 4, SEPARATE),
+    "far away": replace(make_content(400, 5, SHARED), world_offset=(4.5e6, -2.25e5, 1.0)),
+}
+
+
+def written(content: FileContent) -> bytes:
+    heads = make_heads(np.random.default_rng(5), content.dimensions)
+    return write_content(replace(content, heads=heads))
+
+
+def cameras_around(content: FileContent) -> list[Camera]:
+    """Two: one beside the scene, one within it, their principal points off the middle."""
+    middle = content.coordinates.mean(0) * content.voxel_size + np.array(content.world_offset)
+    extent = float(np.ptp(content.coordinates, axis=0).max()) * content.voxel_size
+    return [
+        _looking(middle + extent * np.array((0.4, -0.5, -1.1)), middle),
+        _looking(middle + extent * np.array((0.05, 0.1, 0.0)), middle + extent),
+    ]
+
+
+def _looking(centre: np.ndarray, target: np.ndarray) -> Camera:
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, (0.0, -1.0, 0.0))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = right, np.cross(forward, right), forward
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    return Camera(pose, 150.0, 160.0, 90.0, 75.0, 200, 140)
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(10 * np.log10(255.0**2 / max(((a.astype(float) - b.astype(float)) ** 2).mean(), 1e-9)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONTENTS)
+def test_the_page_shows_what_the_renderer_does(name: str, browser: str, tmp_path: Path) -> None:
+    content = CONTENTS[name]
+    data = written(content)
+    (tmp_path / "scene.cgs").write_bytes(data)
+    model = compgs.decode(tmp_path / "scene.cgs")
+    cameras = cameras_around(content)
+    pictures, error = visit(browser, tmp_path / "browser", html_page(data, name), cameras)
+    assert error == ": " and len(pictures) == len(cameras)
+    for picture, camera in zip(pictures, cameras, strict=True):
+        image = compgs.render(model, camera).image
+        expected = (image.clamp(0, 1) * 255).round().numpy()
+        assert expected.std() > 10  # something is there to see
+        assert psnr(picture, expected) >= LEAST_DB
+
+
+@pytest.mark.slow
+def test_a_damaged_file_is_named_in_the_page(browser: str, tmp_path: Path) -> None:
+    data = bytearray(written(CONTENTS["paired"]))
+    data[-40] ^= 1
+    _, error = visit(browser, tmp_path / "browser", html_page(bytes(data), "damaged"), [])
+    assert error.startswith("This file is damaged: ") and "checksum does not match" in error

@@ -1,0 +1,34 @@
+"""web/ in Node: the same integers and Gaussians as here, and the page that the package ships."""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import compgs
+
+from .conftest import WEB, run
+
+PAGE = Path(compgs.__file__).parent / "viewer" / "page.html"
+
+
+def test_the_shipped_page_is_the_one_that_web_builds(built: Path) -> None:
+    assert (built / "page.html").read_bytes() == PAGE.read_bytes(), "run make web, and commit page.html"
+
+
+def test_types_hold(node: str) -> None:
+    run([node, "node_modules/typescript/bin/tsc", "--noEmit"])
+
+
+def test_a_browser_decodes_the_same_integers_and_gaussians(node: str, built: Path, tmp_path: Path) -> None:
+    path = os.pathsep.join(filter(None, (str(PAGE.parents[2]), os.environ.get("PYTHONPATH"))))
+    run([sys.executable, "test/make_fixtures.py", str(tmp_path)], PYTHONPATH=path)
+    tests = sorted(str(file) for file in WEB.glob("test/*.test.mjs"))
+    output = run([node, "--test", *tests], CGS_BUILD=str(built), CGS_FIXTURES=str(tmp_path))
+    assert "# fail 0" in output and "# skipped 0" in output
+
+
+def test_the_lock_file_names_no_host() -> None:
+    lock = json.loads((WEB / "package-lock.json").read_text(encoding="utf-8"))
+    assert not any("resolved" in package for package in lock["packages"].values())
+    assert all("integrity" in package for name, package in lock["packages"].items() if name)

@@ -1,0 +1,53 @@
+/** The constants of docs/bitstream.md, under the same names. */
+
+export const MAGIC = [0x93, 0x43, 0x47, 0x53] as const;
+export const VERSION = 2;
+export const OPTIONAL = 0x80;
+export const MAX_SECTIONS = 64;
+export const MAX_ANCHORS = 1 << 24;
+export const MAX_COUPLED_PRIMITIVES = 64;
+export const MAX_REFERENCE_DIM = 256;
+export const MAX_RESIDUAL_DIM = 64;
+export const MAX_SIDE_DIM = 64;
+export const MAX_GROUPS = 16;
+export const MAX_RANGES = 22;
+export const MAX_TABLES = 256;
+export const MAX_WIDTH = 1024;
+export const MAX_SYMBOL = 1 << 18;
+export const FREE_SYMBOLS = 2 ** 20;
+export const SYMBOLS_PER_BYTE = 128;
+export const FREE_NETWORK_PRODUCTS = 2 ** 28;
+export const NETWORK_PRODUCTS_PER_BYTE = 2 ** 15;
+export const FREE_HEAD_PRODUCTS = 2 ** 30;
+export const HEAD_PRODUCTS_PER_BYTE = 2 ** 17;
+export const MAX_METADATA_BYTES = 4096;
+export const SMALLEST = 2 ** -64;
+export const LARGEST = 2 ** 64;
+export const TOTAL = 65536;
+export const GAUSSIAN_COUNT = 128;
+export const GAUSSIAN_CRC32 = 0xad3b4090;
+export const LEVELS = 128;
+export const MAX_HYPER_SYMBOLS = 1024;
+export const MAX_LOWEST = 1 << 18;
+export const MANTISSAS = [1024, 1116, 1217, 1327, 1448, 1579, 1722, 1878] as const;
+export const CHUNK_SYMBOLS = 1 << 20;
+export const SINGLE_STATE_SYMBOLS = 1 << 18;
+export const MAX_ESCAPE_BYTES = 5;
+export const FRACTION_BITS = 12;
+export const ACTIVATION_LIMIT = 2 ** 23;
+export const SLOPE_BITS = 6;
+export const MAX_SHIFT = 30;
+export const BIAS_LIMIT = 2 ** 31;
+export const ACCUMULATOR_LIMIT = 2 ** 52;
+export const MAX_LAYERS = 8;
+export const MAX_LAYER_WIDTH = 1 << 16;
+export const MAX_TENSORS = 256;
+export const MAX_NAME_BYTES = 64;
+export const MAX_RANK = 4;
+export const MAX_EXPONENT = 62;
+export const MAX_WEIGHTS = 1 << 22;
+export const MAX_LOW_BITS = 26;
+/** Levels of the octree; a coordinate's offset has so many bits. */
+export const MAX_DEPTH = 21;
+/** Log scales of an anchor: three of its reach, three of its size. */
+export const LOG_SCALES = 6;

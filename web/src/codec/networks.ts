@@ -1,0 +1,116 @@
+/** The entropy networks section: integer networks that predict means and scales (docs/bitstream.md, "Networks"). */
+
+import {
+  ACCUMULATOR_LIMIT,
+  ACTIVATION_LIMIT,
+  BIAS_LIMIT,
+  MAX_LAYERS,
+  MAX_LAYER_WIDTH,
+  MAX_SHIFT,
+  MAX_WEIGHTS,
+} from "./constants.ts";
+import { FieldReader } from "./fields.ts";
+import { readArrays } from "./integer_arrays.ts";
+import type { Kernels } from "./kernels.ts";
+import type { GroupShape } from "./scene_section.ts";
+
+const RESERVED_BIT = 0x20;
+const ADDS = 0x40;
+const RECTIFY = 0x80;
+
+export interface IntegerLayer {
+  inputs: number;
+  outputs: number;
+  /** [outputs, inputs] */
+  weight: Int32Array;
+  /** [outputs], Q12 */
+  bias: Int32Array;
+  shift: number;
+  rectify: boolean;
+  adds: boolean;
+}
+
+export interface IntegerNetwork {
+  inputs: number;
+  outputs: number;
+  layers: IntegerLayer[];
+  /** Whether the last layer takes the network's inputs, too. */
+  skip: boolean;
+}
+
+type LayerHead = Omit<IntegerLayer, "weight" | "bias">;
+
+/** For each group its network, or null; and the number of all elements of their weights. */
+export function readNetworks(
+  payload: Uint8Array,
+  groups: GroupShape[],
+  name: string,
+  kernels: Kernels,
+): { networks: Array<IntegerNetwork | null>; weights: number } {
+  const reader = new FieldReader(payload, name);
+  const heads = groups.map((group) => (group.hasNetwork ? readHead(reader, group) : null));
+  const layers = heads.flatMap((head) => head?.layers ?? []);
+  const sizes = layers.flatMap(({ inputs, outputs }) => {
+    const half = Math.ceil(outputs / 2);
+    return [half * inputs, (outputs - half) * inputs, half, outputs - half];
+  });
+  const elements = sizes.reduce((a, b) => a + b, 0);
+  if (elements > MAX_WEIGHTS) reader.refuse(`${elements} weights and biases, at most ${MAX_WEIGHTS} are allowed`);
+  const arrays = layers.length ? readArrays(reader, sizes, kernels) : [];
+  reader.end();
+  let next = 0;
+  const networks = heads.map((head) => {
+    if (!head) return null;
+    const whole = head.layers.map((layer) => {
+      const weight = joined(arrays[next]!, arrays[next + 1]!);
+      const bias = joined(arrays[next + 2]!, arrays[next + 3]!);
+      next += 4;
+      return checked({ ...layer, weight, bias }, reader);
+    });
+    return { ...head, layers: whole };
+  });
+  return { networks, weights: layers.reduce((sum, layer) => sum + layer.inputs * layer.outputs, 0) };
+}
+
+function readHead(reader: FieldReader, group: GroupShape): Omit<IntegerNetwork, "layers"> & { layers: LayerHead[] } {
+  const count = reader.varint("layers", 1, MAX_LAYERS);
+  const flags = reader.u8("flags of a network");
+  if (flags > (count > 1 ? 1 : 0)) reader.refuse(`flags of a network of ${count} layers are ${flags}`);
+  const skip = flags === 1;
+  const outputs = 2 * group.width;
+  const layers: LayerHead[] = [];
+  for (let i = 0; i < count; i++) {
+    const isLast = i === count - 1;
+    const width = reader.varint("width of a layer", 1, MAX_LAYER_WIDTH);
+    if (isLast && width !== outputs) reader.refuse(`a network has ${width} outputs, expected ${outputs}`);
+    const bits = reader.u8("flags of a layer");
+    const shift = bits & 0x1f;
+    const adds = (bits & ADDS) !== 0;
+    if (bits & RESERVED_BIT || shift > MAX_SHIFT) reader.refuse(`flags of a layer are ${bits}`);
+    const before = layers[i - 1];
+    const inputs = (before ? before.outputs : group.inputs) + (isLast && skip ? group.inputs : 0);
+    if (adds && (!before || isLast || width !== before.inputs)) {
+      reader.refuse("a layer adds what it cannot: it is the first or the last, or of another width");
+    }
+    layers.push({ inputs, outputs: width, shift, rectify: (bits & RECTIFY) !== 0, adds });
+  }
+  return { inputs: group.inputs, outputs, layers, skip };
+}
+
+function joined(a: Int32Array, b: Int32Array): Int32Array {
+  const all = new Int32Array(a.length + b.length);
+  all.set(a);
+  all.set(b, a.length);
+  return all;
+}
+
+/** The bounds within which every sum is exact in 64-bit floats. */
+function checked(layer: IntegerLayer, reader: FieldReader): IntegerLayer {
+  let largest = 0;
+  for (const weight of layer.weight) largest = Math.max(largest, Math.abs(weight));
+  if (layer.inputs * largest * ACTIVATION_LIMIT >= ACCUMULATOR_LIMIT) {
+    reader.refuse(`a layer of ${layer.inputs} inputs has a weight of ${largest}: its sums could leave 52 bits`);
+  }
+  for (const bias of layer.bias) if (Math.abs(bias) >= BIAS_LIMIT) reader.refuse(`a bias is ${bias}`);
+  return layer;
+}

@@ -1,0 +1,15 @@
+/** Files that the build embeds as bytes. */
+declare module "*.bin" {
+  const bytes: Uint8Array;
+  export default bytes;
+}
+/** assembly/, compiled by the build. */
+declare module "compgs:kernels" {
+  const bytes: Uint8Array<ArrayBuffer>;
+  export default bytes;
+}
+/** The worker's program, bundled by the build. */
+declare module "compgs:worker" {
+  const source: string;
+  export default source;
+}

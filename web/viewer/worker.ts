@@ -1,0 +1,169 @@
+/** The worker: decodes a file as it arrives, predicts its splats, and sorts them for the camera at hand. */
+
+import type { Kernels } from "../src/codec/kernels.ts";
+import type { Scene } from "../src/codec/scene_decoder.ts";
+import { type Appearance, OPACITY_CUTOFF, Predictor } from "../src/prediction/predictor.ts";
+import { ProgressiveDecoder } from "../src/progressive.ts";
+import { chooseKernels } from "./choose_kernels.ts";
+import { DepthOrder } from "./depth_order.ts";
+import type { Eye, FromWorker, SceneInfo, ToWorker } from "./messages.ts";
+import { appearanceRows, geometryPlanes, rowsOf } from "./splat_planes.ts";
+
+/** Coupled primitives whose opacity and color follow the camera in one frame. */
+const PART = 50_000;
+const NEAR = 0.01;
+
+interface Shown {
+  predictor: Predictor;
+  appearance: Appearance;
+  /** Anchor with which the next part begins, and anchors that have not seen the camera yet. */
+  nextAnchor: number;
+  remaining: number;
+}
+
+declare const self: {
+  onmessage: ((event: MessageEvent<ToWorker>) => void) | null;
+  postMessage(message: FromWorker, transfer?: Transferable[]): void;
+};
+
+const kernels = chooseKernels();
+const depthOrder = new DepthOrder();
+let shown: Shown | null = null;
+let eye: Eye | null = null;
+let isStale = false;
+let isScheduled = false;
+/** Files opened so far: what an earlier one still has to say is dropped. */
+let opened = 0;
+
+self.onmessage = ({ data }) => {
+  if (data.kind === "bytes") void open(++opened, streamOf(new Uint8Array(data.bytes)), data.bytes.byteLength);
+  else if (data.kind === "url") void openUrl(++opened, data.url);
+  else setEye(data.eye);
+};
+
+function setEye(next: Eye): void {
+  const moved = !eye || next.centre.some((x, axis) => x !== eye!.centre[axis]);
+  eye = next;
+  isStale = true;
+  if (shown && moved) shown.remaining = shown.predictor.primitives.anchors;
+  schedule();
+}
+
+async function openUrl(ticket: number, url: string): Promise<void> {
+  try {
+    const response = await fetch(url).catch((error: Error) => {
+      throw new Error(`${url} cannot be fetched (${error.message}). Another site must allow it by CORS headers.`);
+    });
+    if (!response.ok) throw new Error(`${url}: the server answers ${response.status} ${response.statusText}`);
+    const length = Number(response.headers.get("Content-Length")) || null;
+    await open(ticket, response.body!, response.headers.get("Content-Encoding") ? null : length);
+  } catch (error) {
+    report(ticket, error);
+  }
+}
+
+function streamOf(bytes: Uint8Array): ReadableStream<Uint8Array> {
+  return new ReadableStream({
+    start(controller) {
+      if (bytes.length) controller.enqueue(bytes);
+      controller.close();
+    },
+  });
+}
+
+async function open(ticket: number, stream: ReadableStream<Uint8Array>, total: number | null): Promise<void> {
+  try {
+    const chosen = await kernels;
+    const decoder = new ProgressiveDecoder(chosen);
+    const reader = stream.getReader();
+    let loaded = 0;
+    for (;;) {
+      const { done, value } = await reader.read();
+      if (ticket !== opened) return;
+      if (done) break;
+      loaded += value.length;
+      const isFiner = decoder.push(value);
+      self.postMessage({ kind: "progress", loaded, total: total ?? decoder.expectedBytes });
+      if (isFiner) show(decoder.scene(), chosen);
+    }
+    decoder.finish();
+    self.postMessage({ kind: "complete", bytes: loaded });
+  } catch (error) {
+    report(ticket, error);
+  }
+}
+
+function report(ticket: number, error: unknown): void {
+  if (ticket !== opened) return;
+  const { name, message } = error instanceof Error ? error : new Error(String(error));
+  self.postMessage({ kind: "error", name, message });
+}
+
+function show(scene: Scene, chosen: Kernels): void {
+  const predictor = new Predictor(scene, chosen);
+  shown = {
+    predictor,
+    appearance: predictor.newAppearance(),
+    nextAnchor: 0,
+    remaining: predictor.primitives.anchors,
+  };
+  const planes = geometryPlanes(predictor.geometry);
+  const message: FromWorker = { kind: "scene", info: infoOf(scene, predictor), planes, rows: rowsOf(scene.coupled) };
+  self.postMessage(message, [planes.buffer]);
+  isStale = true;
+  schedule();
+}
+
+function infoOf(scene: Scene, { positions }: Predictor): SceneInfo {
+  const range = [0, 1, 2].map((axis) => {
+    const sorted = Float32Array.from({ length: scene.anchors }, (_, n) => positions[3 * n + axis]!).sort();
+    const at = (share: number): number => sorted[Math.floor(share * (sorted.length - 1))]!;
+    return { middle: at(0.5), half: (at(0.9) - at(0.1)) / 2 };
+  });
+  const { anchors, totalAnchors, coupled, background, worldOffset, viewpoints } = scene;
+  const middle: [number, number, number] = [range[0]!.middle, range[1]!.middle, range[2]!.middle];
+  const extent = Math.max(...range.map(({ half }) => half), scene.voxelSize);
+  return { anchors, totalAnchors, coupled, background, worldOffset, viewpoints, middle, extent };
+}
+
+/** One frame at a time, with room for messages in between. */
+function schedule(): void {
+  if (isScheduled || !shown || !eye || !(isStale || shown.remaining)) return;
+  isScheduled = true;
+  setTimeout(() => {
+    isScheduled = false;
+    nextFrame(shown!, eye!);
+    schedule();
+  }, 0);
+}
+
+function nextFrame(scene: Shown, { id, centre, axis }: Eye): void {
+  const { predictor, appearance } = scene;
+  let rows: { values: Float32Array; firstRow: number } | null = null;
+  if (scene.remaining) {
+    const { firstCoupled, anchors } = predictor.primitives;
+    const first = scene.nextAnchor;
+    const most = Math.min(anchors, first + scene.remaining);
+    let end = first + 1;
+    while (end < most && firstCoupled[end + 1]! - firstCoupled[first]! <= PART) end++;
+    predictor.predictAppearance(centre, appearance, first, end);
+    rows = appearanceRows(appearance, firstCoupled[first]!, firstCoupled[end]!);
+    scene.nextAnchor = end % anchors;
+    scene.remaining -= end - first;
+  }
+  isStale = false;
+  const { means, sound } = predictor.geometry;
+  const shift = -(axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2]);
+  const order = depthOrder.sort(means, appearance.opacities, sound, axis, shift, OPACITY_CUTOFF, NEAR);
+  self.postMessage(
+    {
+      kind: "frame",
+      id,
+      order,
+      appearance: rows && rows.values,
+      firstRow: rows ? rows.firstRow : 0,
+      settled: scene.remaining === 0,
+    },
+    [order.buffer, ...(rows ? [rows.values.buffer] : [])],
+  );
+}
