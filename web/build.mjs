@@ -49,7 +49,13 @@ const shared = {
 
 /** The bundled text of a program that is embedded in another. */
 async function bundled(entry, options = {}) {
-  const { outputFiles } = await build({ ...shared, entryPoints: [entry], format: "iife", write: false, ...options });
+  const { outputFiles } = await build({
+    ...shared,
+    entryPoints: [entry],
+    format: "iife",
+    write: false,
+    ...options,
+  });
   return outputFiles[0].text;
 }
 
@@ -63,9 +69,17 @@ const embedWorker = {
 };
 
 await build({ ...shared, entryPoints: ["src/index.ts"], outfile: `${folder}/compgs.js` });
-await build({ ...shared, entryPoints: ["viewer/viewer.ts"], outfile: `${folder}/viewer.js`, plugins: [embedKernels, embedWorker] });
+await build({
+  ...shared,
+  entryPoints: ["viewer/viewer.ts"],
+  outfile: `${folder}/viewer.js`,
+  plugins: [embedKernels, embedWorker],
+});
 
 const script = await bundled("viewer/page.ts", { plugins: [embedKernels, embedWorker] });
 const template = await readFile("viewer/page.html", "utf8");
 // A function, as replacement patterns in the script must stay what they are.
-await writeFile(`${folder}/page.html`, template.replace("{{script}}", () => script.trim()));
+await writeFile(
+  `${folder}/page.html`,
+  template.replace("{{script}}", () => script.trim()),
+);

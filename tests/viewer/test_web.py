@@ -16,8 +16,9 @@ def test_the_shipped_page_is_the_one_that_web_builds(built: Path) -> None:
     assert (built / "page.html").read_bytes() == PAGE.read_bytes(), "run make web, and commit page.html"
 
 
-def test_types_hold(node: str) -> None:
+def test_style_and_types_hold(node: str) -> None:
     run([node, "node_modules/typescript/bin/tsc", "--noEmit"])
+    run([node, "node_modules/prettier/bin/prettier.cjs", "--check", "."])
 
 
 def test_a_browser_decodes_the_same_integers_and_gaussians(node: str, built: Path, tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-/** The kernels of src/codec/kernels.ts and src/prediction in WebAssembly; the plain TypeScript is what they must equal. */
+/**
+ * The kernels of src/codec/kernels.ts and src/prediction in WebAssembly; the plain TypeScript is what they must equal.
+ */
 
 export { alloc, mark, release } from "./memory";
 export { setTables } from "./mixing";

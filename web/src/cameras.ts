@@ -19,11 +19,20 @@ export function cameraCentre({ worldToCamera: m }: Pick<Camera, "worldToCamera">
 }
 
 /** 4 x 4 world to camera of a rotation (unit quaternion w, x, y, z) and a camera's centre. */
-export function poseOf([w, x, y, z]: ArrayLike<number> & Iterable<number>, centre: ArrayLike<number>): Float64Array {
+export function poseOf(
+  [w, x, y, z]: ArrayLike<number> & Iterable<number>,
+  centre: ArrayLike<number>,
+): Float64Array {
   const r = [
-    1 - 2 * (y! * y! + z! * z!), 2 * (x! * y! - w! * z!), 2 * (x! * z! + w! * y!),
-    2 * (x! * y! + w! * z!), 1 - 2 * (x! * x! + z! * z!), 2 * (y! * z! - w! * x!),
-    2 * (x! * z! - w! * y!), 2 * (y! * z! + w! * x!), 1 - 2 * (x! * x! + y! * y!),
+    1 - 2 * (y! * y! + z! * z!),
+    2 * (x! * y! - w! * z!),
+    2 * (x! * z! + w! * y!),
+    2 * (x! * y! + w! * z!),
+    1 - 2 * (x! * x! + z! * z!),
+    2 * (y! * z! - w! * x!),
+    2 * (x! * z! - w! * y!),
+    2 * (y! * z! + w! * x!),
+    1 - 2 * (x! * x! + y! * y!),
   ] as const;
   const pose = new Float64Array(16);
   for (let row = 0; row < 3; row++) {

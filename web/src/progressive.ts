@@ -1,6 +1,12 @@
 /** A scene from the bytes of a file as they arrive: coarse first, finer with each range that is complete. */
 
-import { type Section, type SectionEntry, SectionNumber, readHeader, unpackSection } from "./codec/container.ts";
+import {
+  type Section,
+  type SectionEntry,
+  SectionNumber,
+  readHeader,
+  unpackSection,
+} from "./codec/container.ts";
 import type { Kernels } from "./codec/kernels.ts";
 import { plainKernels } from "./codec/plain_kernels.ts";
 import { type Scene, SceneDecoder } from "./codec/scene_decoder.ts";

@@ -94,7 +94,14 @@ class WasmKernels implements Kernels {
       const places = [base, entries, lowest, frequencies, cumulated, hints].map((table) => this.put(table));
       const chosen = this.put(choices);
       const out = this.wasm.alloc(4 * symbols.length);
-      const problem = this.wasm.decodeChunk(this.put(words), words.length, ...places, chosen, out, symbols.length);
+      const problem = this.wasm.decodeChunk(
+        this.put(words),
+        words.length,
+        ...places,
+        chosen,
+        out,
+        symbols.length,
+      );
       if (problem) throw new CorruptSection(`${section}: ${CHUNK_PROBLEMS[problem]}`);
       symbols.set(new Int32Array(this.wasm.memory.buffer, out, symbols.length));
     });
@@ -122,7 +129,14 @@ class WasmKernels implements Kernels {
     });
   }
 
-  private applyLayer(layer: IntegerLayer, x: number, y: number, taken: number, stride: number, rows: number): void {
+  private applyLayer(
+    layer: IntegerLayer,
+    x: number,
+    y: number,
+    taken: number,
+    stride: number,
+    rows: number,
+  ): void {
     const { inputs, outputs, shift, rectify, adds } = layer;
     this.within(() => {
       const padded = evened(outputs);
@@ -184,7 +198,14 @@ class WasmKernels implements Kernels {
   }
 
   /** Rows [rows, columns] into wider ones, from `column` on. */
-  private spread(to: number, stride: number, from: Float64Array, columns: number, rows: number, column: number): void {
+  private spread(
+    to: number,
+    stride: number,
+    from: Float64Array,
+    columns: number,
+    rows: number,
+    column: number,
+  ): void {
     const all = new Float64Array(this.wasm.memory.buffer, to, stride * rows);
     for (let row = 0; row < rows; row++) {
       for (let i = 0; i < columns; i++) all[row * stride + column + i] = from[row * columns + i]!;

@@ -73,5 +73,7 @@ function assertViewpoints(found, expected) {
 
 function close(found, expected, tolerance) {
   assert.equal(found.length, expected.length);
-  expected.forEach((x, i) => assert.ok(Math.abs(found[i] - x) <= tolerance, `${found} is not near ${expected}`));
+  expected.forEach((x, i) =>
+    assert.ok(Math.abs(found[i] - x) <= tolerance, `${found} is not near ${expected}`),
+  );
 }

@@ -68,7 +68,9 @@ export function hashesOf(scene) {
 }
 
 function sha256(array) {
-  return createHash("sha256").update(new Uint8Array(array.buffer, array.byteOffset, array.byteLength)).digest("hex");
+  return createHash("sha256")
+    .update(new Uint8Array(array.buffer, array.byteOffset, array.byteLength))
+    .digest("hex");
 }
 
 /** Symbols [N, K, channels], 0 where nothing exists. */

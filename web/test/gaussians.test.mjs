@@ -27,7 +27,13 @@ for (const { name, bytes, expected, arrays } of fixtures()) {
   }
 }
 
-const PINNED = { mean: "means", quaternion: "quaternions", scales: "scales", opacity: "opacities", color: "colors" };
+const PINNED = {
+  mean: "means",
+  quaternion: "quaternions",
+  scales: "scales",
+  opacity: "opacities",
+  color: "colors",
+};
 
 for (const { name, bytes, pinned } of goldenGaussians()) {
   for (const [kind, kernels] of Object.entries(KINDS)) {
@@ -43,12 +49,17 @@ for (const { name, bytes, pinned } of goldenGaussians()) {
         truth.forEach((x, i) => {
           const row = [pinned.first[Math.floor(i / columns)][number]].flat();
           const largest = Math.max(1, ...row.map(Math.abs));
-          assert.ok(Math.abs(found[field][i] - x) <= 1e-4 * largest, `${field} ${i}: ${found[field][i]}, not ${x}`);
+          assert.ok(
+            Math.abs(found[field][i] - x) <= 1e-4 * largest,
+            `${field} ${i}: ${found[field][i]}, not ${x}`,
+          );
         });
         const sums = new Array(columns).fill(0);
         found[field].forEach((x, i) => (sums[i % columns] += x));
         const scale = 1 + found[field].reduce((sum, x) => sum + Math.abs(x), 0);
-        [pinned.sums[number]].flat().forEach((x, i) => assert.ok(Math.abs(sums[i] - x) <= 1e-4 * scale, `sum of ${field}`));
+        [pinned.sums[number]]
+          .flat()
+          .forEach((x, i) => assert.ok(Math.abs(sums[i] - x) <= 1e-4 * scale, `sum of ${field}`));
       }
     });
   }
@@ -59,11 +70,15 @@ function assertClose(field, found, truth, columns, sizes) {
   assert.equal(found.length, truth.length);
   const largest = truth.reduce((most, x) => Math.max(most, Math.abs(x)), 0);
   for (let i = 0; i < truth.length; i++) {
-    const row = truth.subarray(columns * Math.floor(i / columns), columns * Math.floor(i / columns) + columns);
-    const allowed = {
-      means: 2e-5 * largest,
-      scales: 2e-4 * truth[i] + 2e-6 * sizes[i],
-    }[field] ?? 2e-4 * Math.max(1, Math.hypot(...row));
+    const row = truth.subarray(
+      columns * Math.floor(i / columns),
+      columns * Math.floor(i / columns) + columns,
+    );
+    const allowed =
+      {
+        means: 2e-5 * largest,
+        scales: 2e-4 * truth[i] + 2e-6 * sizes[i],
+      }[field] ?? 2e-4 * Math.max(1, Math.hypot(...row));
     assert.ok(Math.abs(found[i] - truth[i]) <= allowed, `${field} ${i}: ${found[i]}, expected ${truth[i]}`);
   }
 }

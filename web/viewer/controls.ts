@@ -41,8 +41,10 @@ export class Controls {
     private readonly moved: () => void,
   ) {
     const { signal } = this.listening;
-    const on = <K extends keyof HTMLElementEventMap>(name: K, call: (event: HTMLElementEventMap[K]) => void): void =>
-      element.addEventListener(name, call, { signal, passive: false });
+    const on = <K extends keyof HTMLElementEventMap>(
+      name: K,
+      call: (event: HTMLElementEventMap[K]) => void,
+    ): void => element.addEventListener(name, call, { signal, passive: false });
     element.tabIndex = 0;
     element.style.touchAction = "none";
     on("pointerdown", (event) => {
@@ -51,7 +53,8 @@ export class Controls {
       this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     });
     on("pointermove", (event) => this.drag(event));
-    for (const name of ["pointerup", "pointercancel"] as const) on(name, (event) => this.pointers.delete(event.pointerId));
+    for (const name of ["pointerup", "pointercancel"] as const)
+      on(name, (event) => this.pointers.delete(event.pointerId));
     on("wheel", (event) => {
       event.preventDefault();
       const pixels = event.deltaY * (event.deltaMode === 1 ? 16 : 1);
@@ -76,7 +79,8 @@ export class Controls {
     this.pointers.set(event.pointerId, now);
     if (others.length) {
       const other = others[0]!;
-      const spread = Math.hypot(now.x - other.x, now.y - other.y) / Math.hypot(before.x - other.x, before.y - other.y);
+      const spread =
+        Math.hypot(now.x - other.x, now.y - other.y) / Math.hypot(before.x - other.x, before.y - other.y);
       this.pan(dx / 2, dy / 2);
       if (spread > 0 && Number.isFinite(spread)) this.approach(1 / spread);
     } else if (event.buttons & 6 || event.shiftKey) this.pan(dx, dy);

@@ -31,7 +31,8 @@ export class DepthOrder {
     }
     const { keys, chosen, spare } = this;
     const [x, y, z] = axis;
-    const depthOf = (p: number): number => x * means[3 * p]! + y * means[3 * p + 1]! + z * means[3 * p + 2]! + shift;
+    const depthOf = (p: number): number =>
+      x * means[3 * p]! + y * means[3 * p + 1]! + z * means[3 * p + 2]! + shift;
     let count = 0;
     let [nearest, farthest] = [Infinity, near];
     for (let p = 0; p < total; p++) {

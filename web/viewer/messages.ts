@@ -12,9 +12,7 @@ export interface Eye {
 }
 
 export type ToWorker =
-  | { kind: "bytes"; bytes: ArrayBuffer }
-  | { kind: "url"; url: string }
-  | { kind: "eye"; eye: Eye };
+  { kind: "bytes"; bytes: ArrayBuffer } | { kind: "url"; url: string } | { kind: "eye"; eye: Eye };
 
 /** What the page shows about a scene, and what a camera starts from. */
 export interface SceneInfo {
@@ -33,6 +31,13 @@ export type FromWorker =
   | { kind: "progress"; loaded: number; total: number | null }
   | { kind: "scene"; info: SceneInfo; planes: Float32Array; rows: number }
   /** Primitives to draw, the farthest first; colors and opacities of some rows of them. */
-  | { kind: "frame"; id: number; order: Uint32Array; appearance: Float32Array | null; firstRow: number; settled: boolean }
+  | {
+      kind: "frame";
+      id: number;
+      order: Uint32Array;
+      appearance: Float32Array | null;
+      firstRow: number;
+      settled: boolean;
+    }
   | { kind: "complete"; bytes: number }
   | { kind: "error"; name: string; message: string };

@@ -15,6 +15,16 @@ function embedded(): Uint8Array | null {
   return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 }
 
+/** The name of a file in an address, without its ending. */
+function nameOf(url: string): string {
+  const last = new URL(url, document.baseURI).pathname.split("/").pop()!;
+  try {
+    return decodeURIComponent(last).replace(/\.cgs$/, "") || document.title;
+  } catch {
+    return last; // it has a percent sign that is no code
+  }
+}
+
 function sayError(title: string, text: string): void {
   element("error-title").textContent = title;
   element("error-text").textContent = text;
@@ -36,7 +46,8 @@ function explain(name: string, message: string): void {
 
 function describe(info: SceneInfo): string {
   const splats = info.coupled.toLocaleString("en");
-  const share = info.anchors < info.totalAnchors ? `, ${Math.round((100 * info.anchors) / info.totalAnchors)} %` : "";
+  const share =
+    info.anchors < info.totalAnchors ? `, ${Math.round((100 * info.anchors) / info.totalAnchors)} %` : "";
   return `${splats} splats${share}`;
 }
 
@@ -71,8 +82,10 @@ function start(): void {
   const data = embedded();
   const url = new URLSearchParams(location.search).get("url");
   if (data) open(data);
-  else if (url) open(url);
-  else element("welcome").hidden = false;
+  else if (url) {
+    document.title = nameOf(url);
+    open(url);
+  } else element("welcome").hidden = false;
 }
 
 function wireButtons(viewer: Viewer): void {
@@ -111,7 +124,8 @@ function wireFiles(open: (source: ArrayBuffer) => void): void {
     event.preventDefault();
     document.body.classList.add("dropping");
   });
-  for (const name of ["dragleave", "drop"]) addEventListener(name, () => document.body.classList.remove("dropping"));
+  for (const name of ["dragleave", "drop"])
+    addEventListener(name, () => document.body.classList.remove("dropping"));
   addEventListener("drop", (event) => {
     event.preventDefault();
     void read(event.dataTransfer?.files[0]);

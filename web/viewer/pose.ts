@@ -36,7 +36,8 @@ export class Pose {
   static lookingAt(centre: Vector, target: Vector, up: Vector): Pose {
     const forward = unit(add(target, centre, -1));
     let right = cross(forward, up);
-    if (Math.hypot(...right) < 1e-6) right = cross(forward, Math.abs(forward[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]);
+    if (Math.hypot(...right) < 1e-6)
+      right = cross(forward, Math.abs(forward[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]);
     right = unit(right);
     return new Pose(centre, right, cross(forward, right), forward);
   }

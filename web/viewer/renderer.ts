@@ -56,6 +56,11 @@ export class Renderer {
   /** `planes`: of `rows` rows of 2048 primitives, means, then upper and lower parts of covariances, 4 floats each. */
   setGeometry(planes: Float32Array, rows: number): void {
     const { gl } = this;
+    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE) as number;
+    if (PLANES * rows > most) {
+      const splats = (Math.floor(most / PLANES) * ROW).toLocaleString("en");
+      throw new Error(`The scene has more splats than the ${splats} that this device's graphics can hold.`);
+    }
     gl.deleteTexture(this.geometry);
     gl.deleteTexture(this.appearance);
     this.rows = rows;
@@ -151,7 +156,10 @@ function newTexture(gl: WebGL2RenderingContext, format: number, width: number, h
 
 function link(gl: WebGL2RenderingContext, vertex: string, fragment: string): WebGLProgram {
   const program = gl.createProgram()!;
-  for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]] as const) {
+  for (const [kind, source] of [
+    [gl.VERTEX_SHADER, vertex],
+    [gl.FRAGMENT_SHADER, fragment],
+  ] as const) {
     const shader = gl.createShader(kind)!;
     gl.shaderSource(shader, source);
     gl.compileShader(shader);
@@ -160,7 +168,9 @@ function link(gl: WebGL2RenderingContext, vertex: string, fragment: string): Web
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
     const logs = gl.getAttachedShaders(program)!.map((shader) => gl.getShaderInfoLog(shader));
-    throw new Error(`the viewer's shaders do not compile here: ${[gl.getProgramInfoLog(program), ...logs].join(" ")}`);
+    throw new Error(
+      `the viewer's shaders do not compile here: ${[gl.getProgramInfoLog(program), ...logs].join(" ")}`,
+    );
   }
   return program;
 }

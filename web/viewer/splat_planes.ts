@@ -25,22 +25,39 @@ export function geometryPlanes({ means, quaternions, scales }: Geometry): Float3
 
 /** xx, xy, xz, yy, yz, zz of R(q) diag(scales)^2 R(q)^T. */
 export function covarianceOf(quaternions: Float32Array, scales: Float32Array, p: number): number[] {
-  const [qw, qx, qy, qz] = quaternions.subarray(4 * p, 4 * p + 4) as unknown as [number, number, number, number];
+  const [qw, qx, qy, qz] = quaternions.subarray(4 * p, 4 * p + 4) as unknown as [
+    number,
+    number,
+    number,
+    number,
+  ];
   const unit = 1 / Math.hypot(qw, qx, qy, qz);
   const [w, x, y, z] = [qw * unit, qx * unit, qy * unit, qz * unit];
   const r = [
-    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    1 - 2 * (y * y + z * z),
+    2 * (x * y - w * z),
+    2 * (x * z + w * y),
+    2 * (x * y + w * z),
+    1 - 2 * (x * x + z * z),
+    2 * (y * z - w * x),
+    2 * (x * z - w * y),
+    2 * (y * z + w * x),
+    1 - 2 * (x * x + y * y),
   ];
   const s = [scales[3 * p]! ** 2, scales[3 * p + 1]! ** 2, scales[3 * p + 2]! ** 2];
   const entry = (i: number, j: number): number =>
-    r[3 * i]! * s[0]! * r[3 * j]! + r[3 * i + 1]! * s[1]! * r[3 * j + 1]! + r[3 * i + 2]! * s[2]! * r[3 * j + 2]!;
+    r[3 * i]! * s[0]! * r[3 * j]! +
+    r[3 * i + 1]! * s[1]! * r[3 * j + 1]! +
+    r[3 * i + 2]! * s[2]! * r[3 * j + 2]!;
   return [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)];
 }
 
 /** Colors and opacities of whole rows that hold primitives first ... end - 1. */
-export function appearanceRows(appearance: Appearance, first: number, end: number): { values: Float32Array; firstRow: number } {
+export function appearanceRows(
+  appearance: Appearance,
+  first: number,
+  end: number,
+): { values: Float32Array; firstRow: number } {
   const { opacities, colors } = appearance;
   const firstRow = Math.floor(first / ROW);
   const rows = Math.max(1, Math.ceil(end / ROW) - firstRow);

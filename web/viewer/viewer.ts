@@ -48,6 +48,9 @@ export class Viewer {
     this.canvas.style.cssText = "display:block;width:100%;height:100%;outline:none";
     this.renderer = new Renderer(this.canvas);
     container.append(this.canvas);
+    this.canvas.addEventListener("webglcontextlost", () => {
+      options.onError?.("Error", "The browser has taken back its graphics memory. Load the page again.");
+    });
     this.controls = new Controls(this.canvas, () => this.move());
     this.worker = new Worker(URL.createObjectURL(new Blob([workerSource], { type: "text/javascript" })));
     this.worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.receive(data);
@@ -60,6 +63,7 @@ export class Viewer {
   /** Shows a file: its bytes, or the address to stream it from. */
   open(source: ArrayBuffer | Uint8Array | string): void {
     this.info = null;
+    this.view = 0;
     this.controls.target = null;
     this.fixed = null;
     this.isTouched = false;
@@ -127,7 +131,12 @@ export class Viewer {
     else if (message.kind === "scene") {
       this.info = message.info;
       renderer.background = message.info.background;
-      renderer.setGeometry(message.planes, message.rows);
+      try {
+        renderer.setGeometry(message.planes, message.rows);
+      } catch (error) {
+        options.onError?.("Error", (error as Error).message);
+        return;
+      }
       if (!this.isTouched) this.goTo(this.view);
       else this.changed();
       options.onScene?.(message.info);

@@ -52,7 +52,9 @@ function setEye(next: Eye): void {
 async function openUrl(ticket: number, url: string): Promise<void> {
   try {
     const response = await fetch(url).catch((error: Error) => {
-      throw new Error(`${url} cannot be fetched (${error.message}). Another site must allow it by CORS headers.`);
+      throw new Error(
+        `${url} cannot be fetched (${error.message}). Another site must allow it by CORS headers.`,
+      );
     });
     if (!response.ok) throw new Error(`${url}: the server answers ${response.status} ${response.statusText}`);
     const length = Number(response.headers.get("Content-Length")) || null;
@@ -108,10 +110,16 @@ function show(scene: Scene, chosen: Kernels): void {
     remaining: predictor.primitives.anchors,
   };
   const planes = geometryPlanes(predictor.geometry);
-  const message: FromWorker = { kind: "scene", info: infoOf(scene, predictor), planes, rows: rowsOf(scene.coupled) };
+  const message: FromWorker = {
+    kind: "scene",
+    info: infoOf(scene, predictor),
+    planes,
+    rows: rowsOf(scene.coupled),
+  };
+  // A finer scene takes the place of the coarser one in full: its first frame comes with it.
+  const frame = eye && frameOf(shown, eye, Infinity);
   self.postMessage(message, [planes.buffer]);
-  isStale = true;
-  schedule();
+  if (frame) post(frame);
 }
 
 function infoOf(scene: Scene, { positions }: Predictor): SceneInfo {
@@ -132,12 +140,19 @@ function schedule(): void {
   isScheduled = true;
   setTimeout(() => {
     isScheduled = false;
-    nextFrame(shown!, eye!);
+    isStale = false;
+    post(frameOf(shown!, eye!, PART));
     schedule();
   }, 0);
 }
 
-function nextFrame(scene: Shown, { id, centre, axis }: Eye): void {
+interface Frame {
+  message: FromWorker;
+  transfer: Transferable[];
+}
+
+/** What is drawn for an eye, after at most `part` more coupled primitives have seen it. */
+function frameOf(scene: Shown, { id, centre, axis }: Eye, part: number): Frame {
   const { predictor, appearance } = scene;
   let rows: { values: Float32Array; firstRow: number } | null = null;
   if (scene.remaining) {
@@ -145,25 +160,23 @@ function nextFrame(scene: Shown, { id, centre, axis }: Eye): void {
     const first = scene.nextAnchor;
     const most = Math.min(anchors, first + scene.remaining);
     let end = first + 1;
-    while (end < most && firstCoupled[end + 1]! - firstCoupled[first]! <= PART) end++;
+    while (end < most && firstCoupled[end + 1]! - firstCoupled[first]! <= part) end++;
     predictor.predictAppearance(centre, appearance, first, end);
     rows = appearanceRows(appearance, firstCoupled[first]!, firstCoupled[end]!);
     scene.nextAnchor = end % anchors;
     scene.remaining -= end - first;
   }
-  isStale = false;
   const { means, sound } = predictor.geometry;
   const shift = -(axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2]);
   const order = depthOrder.sort(means, appearance.opacities, sound, axis, shift, OPACITY_CUTOFF, NEAR);
-  self.postMessage(
-    {
-      kind: "frame",
-      id,
-      order,
-      appearance: rows && rows.values,
-      firstRow: rows ? rows.firstRow : 0,
-      settled: scene.remaining === 0,
-    },
-    [order.buffer, ...(rows ? [rows.values.buffer] : [])],
-  );
+  const settled = scene.remaining === 0;
+  const [values, firstRow] = rows ? [rows.values, rows.firstRow] : [null, 0];
+  return {
+    message: { kind: "frame", id, order, appearance: values, firstRow, settled },
+    transfer: [order.buffer, ...(values ? [values.buffer] : [])],
+  };
+}
+
+function post({ message, transfer }: Frame): void {
+  self.postMessage(message, transfer);
 }

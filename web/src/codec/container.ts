@@ -67,7 +67,10 @@ export function unpack(file: Uint8Array, prefix: boolean): { sections: Section[]
     const end = entry.start + entry.length;
     if (end > file.length) {
       if (prefix && sections.some(isLatents)) {
-        return { sections, hasAllLatents: sections.filter(isLatents).length === entries.filter(isLatents).length };
+        return {
+          sections,
+          hasAllLatents: sections.filter(isLatents).length === entries.filter(isLatents).length,
+        };
       }
       throw new TruncatedSection(
         `${entry.name}: header promises ${entry.length} bytes, file ends after ${Math.max(0, file.length - entry.start)}`,
@@ -91,27 +94,36 @@ export function unpackSection(file: Uint8Array, { number, name, start, length, c
 /** The section table of a file whose header is whole: checks 1 to 9. */
 export function readHeader(file: Uint8Array): SectionEntry[] {
   const isMagic = MAGIC.slice(0, file.length).every((byte, i) => file[i] === byte);
-  if (!isMagic) throw new NotACompGSFile(`file: expected to begin with 93 43 47 53, found ${hex(file.subarray(0, 4))}`);
+  if (!isMagic)
+    throw new NotACompGSFile(`file: expected to begin with 93 43 47 53, found ${hex(file.subarray(0, 4))}`);
   if (file.length < START_BYTES) throw new TruncatedSection(`header: file ends after ${file.length} bytes`);
   const [version, flags, count] = [file[4]!, file[5]!, file[6]!];
   if (version !== VERSION) {
     throw new UnsupportedVersion(`file: version ${version}, this decoder reads version ${VERSION}`);
   }
   const size = START_BYTES + count * ENTRY_BYTES + CRC_BYTES;
-  if (file.length < size) throw new TruncatedSection(`header: needs ${size} bytes, file ends after ${file.length}`);
+  if (file.length < size)
+    throw new TruncatedSection(`header: needs ${size} bytes, file ends after ${file.length}`);
   const view = new DataView(file.buffer, file.byteOffset, size);
   if (crc32(file.subarray(0, size - CRC_BYTES)) !== view.getUint32(size - CRC_BYTES, true)) {
     throw new CorruptSection("header: checksum does not match");
   }
   if (flags !== 0) throw new CorruptSection(`header: flags are ${flags}, expected 0`);
-  if (count > MAX_SECTIONS) throw new CorruptSection(`header: ${count} sections, at most ${MAX_SECTIONS} are allowed`);
+  if (count > MAX_SECTIONS)
+    throw new CorruptSection(`header: ${count} sections, at most ${MAX_SECTIONS} are allowed`);
   const entries: SectionEntry[] = [];
   let start = size;
   for (let i = 0; i < count; i++) {
     const at = START_BYTES + i * ENTRY_BYTES;
     const number = view.getUint8(at);
     const length = view.getUint32(at + 1, true);
-    entries.push({ number, name: NAMES[number] ?? `section ${number}`, start, length, crc: view.getUint32(at + 5, true) });
+    entries.push({
+      number,
+      name: NAMES[number] ?? `section ${number}`,
+      start,
+      length,
+      crc: view.getUint32(at + 5, true),
+    });
     start += length;
   }
   checkNumbers(entries.map((entry) => entry.number));
@@ -121,12 +133,15 @@ export function readHeader(file: Uint8Array): SectionEntry[] {
 function checkNumbers(numbers: number[]): void {
   const unknown = numbers.find((n) => n < OPTIONAL && !(n in NAMES));
   if (unknown !== undefined) {
-    throw new UnsupportedVersion(`header: section ${unknown} is unknown to this decoder and must not be skipped`);
+    throw new UnsupportedVersion(
+      `header: section ${unknown} is unknown to this decoder and must not be skipped`,
+    );
   }
   checkOrder(numbers);
   const { scene, masks, tables, networks, heads, latents, positions, gpccPositions } = SectionNumber;
   for (const required of [scene, masks, tables, networks, heads, latents]) {
-    if (!numbers.includes(required)) throw new CorruptSection(`header: section ${required}, ${NAMES[required]}, is missing`);
+    if (!numbers.includes(required))
+      throw new CorruptSection(`header: section ${required}, ${NAMES[required]}, is missing`);
   }
   const kinds = [positions, gpccPositions].filter((n) => numbers.includes(n)).length;
   if (kinds !== 1) throw new CorruptSection(`header: ${kinds} kinds of positions, expected one`);
@@ -140,7 +155,8 @@ function checkOrder(numbers: number[]): void {
   const known = numbers.filter((n) => n < OPTIONAL);
   for (let i = 1; i < known.length; i++) {
     const repeats = known[i] === SectionNumber.latents && known[i - 1] === SectionNumber.latents;
-    if (known[i]! <= known[i - 1]! && !repeats) throw new CorruptSection(`header: section ${known[i]} is out of order`);
+    if (known[i]! <= known[i - 1]! && !repeats)
+      throw new CorruptSection(`header: section ${known[i]} is out of order`);
   }
   const optional = numbers.filter((n) => n >= OPTIONAL);
   const twice = optional.find((n, i) => optional.indexOf(n) !== i);

@@ -38,9 +38,17 @@ export function readHeads(payload: Uint8Array, name: string, kernels: Kernels): 
     if (elements > MAX_WEIGHTS) reader.refuse(`more than ${MAX_WEIGHTS} elements of tensors`);
     heads.push({ name: tensorName, shape, exponent, size });
   }
-  const arrays = count ? readArrays(reader, heads.map((head) => head.size), kernels) : [];
+  const arrays = count
+    ? readArrays(
+        reader,
+        heads.map((head) => head.size),
+        kernels,
+      )
+    : [];
   reader.end();
-  return new Map(heads.map(({ name, shape, exponent }, i) => [name, { shape, exponent, values: arrays[i]! }]));
+  return new Map(
+    heads.map(({ name, shape, exponent }, i) => [name, { shape, exponent, values: arrays[i]! }]),
+  );
 }
 
 function readName(reader: FieldReader, previous: Uint8Array): Uint8Array {
@@ -49,8 +57,10 @@ function readName(reader: FieldReader, previous: Uint8Array): Uint8Array {
   const name = new Uint8Array(shared + rest.length);
   name.set(previous.subarray(0, shared));
   name.set(rest, shared);
-  if (name.length < 1 || name.length > MAX_NAME_BYTES) reader.refuse(`a tensor's name has ${name.length} bytes`);
-  const mostShared = shared === previous.length || shared === name.length || name[shared] !== previous[shared];
+  if (name.length < 1 || name.length > MAX_NAME_BYTES)
+    reader.refuse(`a tensor's name has ${name.length} bytes`);
+  const mostShared =
+    shared === previous.length || shared === name.length || name[shared] !== previous[shared];
   if (!mostShared) reader.refuse("a name shares fewer bytes than it could");
   return name;
 }

@@ -16,12 +16,14 @@ export function readArrays(reader: FieldReader, sizes: number[], kernels: Kernel
     const table = reader.u8(`table of array ${i}`);
     if (table >= GAUSSIAN_COUNT) reader.refuse(`table of array ${i} is ${table}`);
     const bits = reader.u8(`low_bits of array ${i}`);
-    if (bits > MAX_LOW_BITS) reader.refuse(`low_bits of array ${i} are ${bits}, expected 0 to ${MAX_LOW_BITS}`);
+    if (bits > MAX_LOW_BITS)
+      reader.refuse(`low_bits of array ${i} are ${bits}, expected 0 to ${MAX_LOW_BITS}`);
     tables.push(table);
     lowBits.push(bits);
   });
   const streamBytes = reader.varint("stream_bytes", 0, reader.left);
-  if (streamBytes > reader.left) reader.refuse(`stream_bytes are ${streamBytes}, ${reader.left} bytes are left`);
+  if (streamBytes > reader.left)
+    reader.refuse(`stream_bytes are ${streamBytes}, ${reader.left} bytes are left`);
   const count = sizes.reduce((a, b) => a + b, 0);
   const streamEnd = reader.position + streamBytes;
   const choices = new Uint8Array(count);
@@ -29,7 +31,9 @@ export function readArrays(reader: FieldReader, sizes: number[], kernels: Kernel
   sizes.forEach((size, i) => choices.fill(tables[i]!, first, (first += size)));
   const bitCount = sizes.reduce((sum, size, i) => sum + size * lowBits[i]!, 0);
   if (streamEnd + Math.ceil(bitCount / 8) !== reader.bytes.length) {
-    reader.refuse(`low parts have ${reader.bytes.length - streamEnd} bytes, expected ${Math.ceil(bitCount / 8)}`);
+    reader.refuse(
+      `low parts have ${reader.bytes.length - streamEnd} bytes, expected ${Math.ceil(bitCount / 8)}`,
+    );
   }
   const high = readStream(reader, gaussianTables(), choices, -INT32, INT32 - 1, kernels);
   if (reader.position !== streamEnd) reader.refuse(`the stream does not have its ${streamBytes} bytes`);
@@ -49,7 +53,8 @@ function combine(high: Int32Array, lowBits: number, bits: BitReader, reader: Fie
   const values = new Int32Array(high.length);
   for (let i = 0; i < high.length; i++) {
     const value = high[i]! * scale + bits.take(lowBits) - half;
-    if (value < -INT32 || value >= INT32) reader.refuse(`an element is ${value}, which has more than 32 bits`);
+    if (value < -INT32 || value >= INT32)
+      reader.refuse(`an element is ${value}, which has more than 32 bits`);
     values[i] = value;
   }
   return values;

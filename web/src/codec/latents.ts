@@ -1,6 +1,13 @@
 /** Latents of one range of octree levels (docs/bitstream.md, "Latents"). */
 
-import { FRACTION_BITS, GAUSSIAN_COUNT, MAX_ANCHORS, MAX_COUPLED_PRIMITIVES, MAX_DEPTH, MAX_SYMBOL } from "./constants.ts";
+import {
+  FRACTION_BITS,
+  GAUSSIAN_COUNT,
+  MAX_ANCHORS,
+  MAX_COUPLED_PRIMITIVES,
+  MAX_DEPTH,
+  MAX_SYMBOL,
+} from "./constants.ts";
 import { FieldReader } from "./fields.ts";
 import type { Kernels } from "./kernels.ts";
 import type { IntegerNetwork } from "./networks.ts";
@@ -97,7 +104,11 @@ function readByNetwork(
   let at = 0;
   for (let first = 0; first < anchors.count; first += most) {
     const rows = Math.min(most, anchors.count - first);
-    const outputs = kernels.evaluate(network, networkInputs(group, network, anchors, before, first, rows), rows);
+    const outputs = kernels.evaluate(
+      network,
+      networkInputs(group, network, anchors, before, first, rows),
+      rows,
+    );
     forEachSymbol(group, anchors, first, rows, (row, column) => {
       const place = row * network.outputs + column;
       means[at] = outputs[place]!;
@@ -146,7 +157,8 @@ function networkInputs(
   let column = 0;
   const put = (width: number, value: (place: number) => number): void => {
     for (let row = 0; row < rows; row++) {
-      for (let c = 0; c < width; c++) inputs[row * network.inputs + column + c] = value((first + row) * width + c);
+      for (let c = 0; c < width; c++)
+        inputs[row * network.inputs + column + c] = value((first + row) * width + c);
     }
     column += width;
   };

@@ -17,13 +17,24 @@ export function checkSymbols(anchors: number, groups: GroupShape[], bytes: numbe
 }
 
 export function checkNetworkProducts(anchors: number, weights: number, bytes: number): void {
-  check("entropy networks", "products", anchors * weights, FREE_NETWORK_PRODUCTS + NETWORK_PRODUCTS_PER_BYTE * bytes);
+  check(
+    "entropy networks",
+    "products",
+    anchors * weights,
+    FREE_NETWORK_PRODUCTS + NETWORK_PRODUCTS_PER_BYTE * bytes,
+  );
 }
 
 export function checkHeadProducts(coupled: number, elements: number, bytes: number): void {
-  check("prediction heads", "products", coupled * elements, FREE_HEAD_PRODUCTS + HEAD_PRODUCTS_PER_BYTE * bytes);
+  check(
+    "prediction heads",
+    "products",
+    coupled * elements,
+    FREE_HEAD_PRODUCTS + HEAD_PRODUCTS_PER_BYTE * bytes,
+  );
 }
 
 function check(section: string, what: string, found: number, most: number): void {
-  if (found > most) throw new CorruptSection(`${section}: ${found} ${what}, at most ${most} for a file of this length`);
+  if (found > most)
+    throw new CorruptSection(`${section}: ${found} ${what}, at most ${most} for a file of this length`);
 }

@@ -16,6 +16,7 @@ export function readMasks(
   if (end !== payload.length) {
     throw new CorruptSection(`${name}: ${payload.length} bytes, but the code ends after ${end}`);
   }
-  if (mask.every((flag) => flag === 1)) throw new CorruptSection(`${name}: all flags are 1, expected no bytes`);
+  if (mask.every((flag) => flag === 1))
+    throw new CorruptSection(`${name}: all flags are 1, expected no bytes`);
   return mask;
 }

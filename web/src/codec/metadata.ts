@@ -7,7 +7,8 @@ import { decodeText } from "./heads.ts";
 
 export function readMetadata(payload: Uint8Array, name: string): Map<string, string> {
   const reader = new FieldReader(payload, name);
-  if (payload.length > MAX_METADATA_BYTES) reader.refuse(`${payload.length} bytes, at most ${MAX_METADATA_BYTES}`);
+  if (payload.length > MAX_METADATA_BYTES)
+    reader.refuse(`${payload.length} bytes, at most ${MAX_METADATA_BYTES}`);
   const count = reader.varint("entries", 0, MAX_METADATA_BYTES);
   const metadata = new Map<string, string>();
   let previous: Uint8Array | undefined;

@@ -55,7 +55,8 @@ export function readNetworks(
     return [half * inputs, (outputs - half) * inputs, half, outputs - half];
   });
   const elements = sizes.reduce((a, b) => a + b, 0);
-  if (elements > MAX_WEIGHTS) reader.refuse(`${elements} weights and biases, at most ${MAX_WEIGHTS} are allowed`);
+  if (elements > MAX_WEIGHTS)
+    reader.refuse(`${elements} weights and biases, at most ${MAX_WEIGHTS} are allowed`);
   const arrays = layers.length ? readArrays(reader, sizes, kernels) : [];
   reader.end();
   let next = 0;
@@ -72,7 +73,10 @@ export function readNetworks(
   return { networks, weights: layers.reduce((sum, layer) => sum + layer.inputs * layer.outputs, 0) };
 }
 
-function readHead(reader: FieldReader, group: GroupShape): Omit<IntegerNetwork, "layers"> & { layers: LayerHead[] } {
+function readHead(
+  reader: FieldReader,
+  group: GroupShape,
+): Omit<IntegerNetwork, "layers"> & { layers: LayerHead[] } {
   const count = reader.varint("layers", 1, MAX_LAYERS);
   const flags = reader.u8("flags of a network");
   if (flags > (count > 1 ? 1 : 0)) reader.refuse(`flags of a network of ${count} layers are ${flags}`);
@@ -109,7 +113,9 @@ function checked(layer: IntegerLayer, reader: FieldReader): IntegerLayer {
   let largest = 0;
   for (const weight of layer.weight) largest = Math.max(largest, Math.abs(weight));
   if (layer.inputs * largest * ACTIVATION_LIMIT >= ACCUMULATOR_LIMIT) {
-    reader.refuse(`a layer of ${layer.inputs} inputs has a weight of ${largest}: its sums could leave 52 bits`);
+    reader.refuse(
+      `a layer of ${layer.inputs} inputs has a weight of ${largest}: its sums could leave 52 bits`,
+    );
   }
   for (const bias of layer.bias) if (Math.abs(bias) >= BIAS_LIMIT) reader.refuse(`a bias is ${bias}`);
   return layer;

@@ -135,7 +135,8 @@ export class OctreeWalk {
         unknownHigh |= NEIGHBOUR_HIGH[j]!;
         continue;
       }
-      const occupancy = reference >= 0 ? occupancies[reference]! : 1 << this.childHolding(-2 - reference, height);
+      const occupancy =
+        reference >= 0 ? occupancies[reference]! : 1 << this.childHolding(-2 - reference, height);
       occupiedLow |= OCCUPIED_LOW[256 * j + occupancy]!;
       occupiedHigh |= OCCUPIED_HIGH[256 * j + occupancy]!;
     }
@@ -195,7 +196,12 @@ export class OctreeWalk {
       at[4] = ((8 * step + siblings) * 8 + c) * 8 + taken;
       at[5] = 256 * faceNodes + prefix;
       at[6] = (8 * parents + index) * 8 + c;
-      const bit = this.occupancy.decide(this.decoder, 8 * step + c, 168 + 5 * occupied + few, 8 * scaleGrid + c);
+      const bit = this.occupancy.decide(
+        this.decoder,
+        8 * step + c,
+        168 + 5 * occupied + few,
+        8 * scaleGrid + c,
+      );
       children |= bit << c;
       taken += bit;
     }
@@ -204,7 +210,13 @@ export class OctreeWalk {
     return children;
   }
 
-  private decodeSingles(level: Waiting, node: number, step: number, children: number, references: Int32Array): void {
+  private decodeSingles(
+    level: Waiting,
+    node: number,
+    step: number,
+    children: number,
+    references: Int32Array,
+  ): void {
     const { at } = this.singles;
     const { occupiedLow, occupiedHigh, unknownLow, unknownHigh } = this;
     const height = this.depth - 1 - step;
@@ -269,7 +281,8 @@ export class OctreeWalk {
       for (let axis = 0; axis < 3; axis++) {
         let bit: number;
         if (b === bits - 1) bit = direct.decide(decoder, 3 * sides[axis]! + axis);
-        else if (b === bits - 2) bit = direct.decide(decoder, 27 + 3 * (2 * sides[axis]! + (place[axis]! & 1)) + axis);
+        else if (b === bits - 2)
+          bit = direct.decide(decoder, 27 + 3 * (2 * sides[axis]! + (place[axis]! & 1)) + axis);
         else bit = decoder.decide(32768);
         place[axis] = 2 * place[axis]! + bit;
       }
@@ -281,7 +294,8 @@ export class OctreeWalk {
     for (let half = 0; half < 2; half++) {
       for (let axis = 0; axis < 3; axis++) {
         for (let b = Math.min(low, 2 * half + 2) - 1; b >= 2 * half; b--) {
-          const state = DIRECT_STATES + ((((half * 3 + axis) * 2 + (b & 1)) * 2 + zeros) * 2 + coarse) * 5 + low;
+          const state =
+            DIRECT_STATES + ((((half * 3 + axis) * 2 + (b & 1)) * 2 + zeros) * 2 + coarse) * 5 + low;
           const bit = direct.decide(decoder, state);
           fine[axis]! |= bit << b;
           if (bit) zeros = 0;
@@ -312,7 +326,8 @@ export class OctreeWalk {
           if (reference === NOTHING) continue;
           const child = STEP_CHILD[27 * c + j]!;
           if (reference >= 0) next.neighbours[27 * to + j] = children[8 * reference + child]!;
-          else if (this.childHolding(-2 - reference, height) === child) next.neighbours[27 * to + j] = reference;
+          else if (this.childHolding(-2 - reference, height) === child)
+            next.neighbours[27 * to + j] = reference;
         }
       }
     }
@@ -337,4 +352,3 @@ function stateOf(cell: number, occLow: number, occHigh: number, unkLow: number, 
   if (cell < 32) return ((occLow >>> bit) & 1) + 2 * ((unkLow >>> bit) & 1);
   return ((occHigh >>> bit) & 1) + 2 * ((unkHigh >>> bit) & 1);
 }
-

@@ -84,7 +84,15 @@ for (let c = 0; c < 8; c++) {
     FACES[6 * c + face] = cellBit(cell[0]!, cell[1]!, cell[2]!);
   }
   const side = half.map((h) => (h ? 1 : -1));
-  const axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1]];
+  const axes = [
+    [1, 0, 0],
+    [0, 1, 0],
+    [0, 0, 1],
+    [1, 1, 0],
+    [1, 0, 1],
+    [0, 1, 1],
+    [1, 1, 1],
+  ];
   axes.forEach((used, k) => {
     const d = used.map((u, axis) => u * side[axis]!);
     TOUCHING[7 * c + k] = 9 * (d[0]! + 1) + 3 * (d[1]! + 1) + d[2]! + 1;

@@ -26,5 +26,6 @@ export const plainKernels: Kernels = {
 };
 
 function checkEnd(decoder: ArithmeticDecoder, section: string): void {
-  if (!decoder.endsWell()) throw new CorruptSection(`${section}: the code does not end as an encoder ends it`);
+  if (!decoder.endsWell())
+    throw new CorruptSection(`${section}: the code does not end as an encoder ends it`);
 }

@@ -16,7 +16,12 @@ export interface Positions {
 }
 
 /** The anchors' offsets, in the order of the walk. */
-export function readPositions(payload: Uint8Array, anchors: number, name: string, kernels: Kernels): Positions {
+export function readPositions(
+  payload: Uint8Array,
+  anchors: number,
+  name: string,
+  kernels: Kernels,
+): Positions {
   const reader = new FieldReader(payload, name);
   const least = Math.ceil(anchors / ANCHORS_PER_BYTE);
   if (payload.length < least) {
@@ -53,7 +58,8 @@ function checkFrame(reader: FieldReader, offsets: Int32Array, origin: number[], 
       if (offset > largest[axis]!) largest[axis] = offset;
     }
   }
-  if (smallest.some((offset) => offset >= ORIGIN_UNIT)) reader.refuse("origin is not that of the coordinates");
+  if (smallest.some((offset) => offset >= ORIGIN_UNIT))
+    reader.refuse("origin is not that of the coordinates");
   if (32 - Math.clz32(Math.max(...largest)) !== depth) reader.refuse("depth is not that of the coordinates");
   const leaves = origin.some((o, axis) => o < -(2 ** 31) || o + largest[axis]! > 2 ** 31 - 1);
   if (leaves) reader.refuse("coordinates do not fit into 32 bits");

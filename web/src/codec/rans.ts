@@ -66,6 +66,7 @@ export function decodeChunk(
   }
   if (at !== words.length) refuse("words of a chunk are left over");
   for (let i = 0; i < states; i++) {
-    if (high[i] !== 0 || low[i] !== INITIAL_LOW) refuse("a state of the entropy coder does not end where it began");
+    if (high[i] !== 0 || low[i] !== INITIAL_LOW)
+      refuse("a state of the entropy coder does not end where it began");
   }
 }

@@ -88,8 +88,12 @@ export class SceneDecoder {
     whole: boolean,
   ) {
     const find = (number: number): Section | undefined => sections.find((s) => s.number === number);
-    const [scene, positions, masks] = [SectionNumber.scene, SectionNumber.positions, SectionNumber.masks].map(find);
-    const [tables, networks, heads] = [SectionNumber.tables, SectionNumber.networks, SectionNumber.heads].map(find);
+    const [scene, positions, masks] = [SectionNumber.scene, SectionNumber.positions, SectionNumber.masks].map(
+      find,
+    );
+    const [tables, networks, heads] = [SectionNumber.tables, SectionNumber.networks, SectionNumber.heads].map(
+      find,
+    );
     this.section = readScene(scene!.payload, scene!.name);
     const { anchors, coupled, coupledPrimitives, groups } = this.section;
     if (whole) checkSymbols(anchors, groups, bytes);
@@ -102,7 +106,9 @@ export class SceneDecoder {
     this.headElements = [...this.tensors.values()].reduce((sum, tensor) => sum + tensor.values.length, 0);
     if (whole) checkHeadProducts(coupled, this.headElements, bytes);
     if (!positions) {
-      throw new MissingDependency("positions (G-PCC): this decoder has no G-PCC; write the file with octree positions");
+      throw new MissingDependency(
+        "positions (G-PCC): this decoder has no G-PCC; write the file with octree positions",
+      );
     }
     const found = readPositions(positions.payload, anchors, positions.name, kernels);
     this.depth = found.depth;
@@ -158,10 +164,12 @@ export class SceneDecoder {
       reader.refuse(`level is ${head.level}, expected ${before + 1} to ${this.depth}`);
     }
     const anchors = this.upToLevel[head.level]! - this.anchors;
-    if (head.anchors !== anchors) reader.refuse(`range_anchors is ${head.anchors}, the positions have ${anchors}`);
+    if (head.anchors !== anchors)
+      reader.refuse(`range_anchors is ${head.anchors}, the positions have ${anchors}`);
     const slots = this.section.coupledPrimitives;
     const coupled = countOnes(this.mask.subarray(slots * this.anchors, slots * (this.anchors + anchors)));
-    if (head.coupled !== coupled) reader.refuse(`range_coupled is ${head.coupled}, the masks have ${coupled}`);
+    if (head.coupled !== coupled)
+      reader.refuse(`range_coupled is ${head.coupled}, the masks have ${coupled}`);
   }
 
   /** Refuses a file whose ranges leave anchors out. */
@@ -220,4 +228,3 @@ function countOnes(mask: Uint8Array): number {
   for (let i = 0; i < mask.length; i++) count += mask[i]!;
   return count;
 }
-

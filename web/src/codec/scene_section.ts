@@ -55,13 +55,19 @@ export interface SceneSection {
 export function readScene(payload: Uint8Array, name: string): SceneSection {
   const reader = new FieldReader(payload, name);
   const between = (what: string, value: number, least: number, most: number): number => {
-    if (!(value >= least && value <= most)) reader.refuse(`${what} is ${value}, expected ${least} to ${most}`);
+    if (!(value >= least && value <= most))
+      reader.refuse(`${what} is ${value}, expected ${least} to ${most}`);
     return value;
   };
   const upTo = (what: string, value: number): number => between(what, value, -LARGEST, LARGEST);
   const anchors = between("anchors", reader.u32("anchors"), 1, MAX_ANCHORS);
   const coupled = reader.u32("coupled");
-  const coupledPrimitives = between("coupled_primitives", reader.u8("coupled_primitives"), 1, MAX_COUPLED_PRIMITIVES);
+  const coupledPrimitives = between(
+    "coupled_primitives",
+    reader.u8("coupled_primitives"),
+    1,
+    MAX_COUPLED_PRIMITIVES,
+  );
   between("coupled", coupled, 0, anchors * coupledPrimitives);
   const residualDim = between("residual_dim", reader.u8("residual_dim"), 1, MAX_RESIDUAL_DIM);
   const heads = between("heads", reader.u8("heads"), 0, 1) === 0 ? "separate" : "paired";
@@ -69,14 +75,24 @@ export function readScene(payload: Uint8Array, name: string): SceneSection {
   const voxelSize = between("voxel_size", reader.f64("voxel_size"), SMALLEST, LARGEST);
   const offset = () => upTo("world_offset", reader.f64("world_offset"));
   const worldOffset: [number, number, number] = [offset(), offset(), offset()];
-  const viewDistanceScale = between("view_distance_scale", reader.f64("view_distance_scale"), SMALLEST, LARGEST);
+  const viewDistanceScale = between(
+    "view_distance_scale",
+    reader.f64("view_distance_scale"),
+    SMALLEST,
+    LARGEST,
+  );
   const color = () => upTo("background", reader.f32("background"));
   const background: [number, number, number] = [color(), color(), color()];
   const count = between("groups", reader.u8("groups"), 1, MAX_GROUPS);
   const groups: GroupShape[] = [];
   for (let i = 0; i < count; i++) groups.push(readGroup(reader, groups, coupledPrimitives));
   reader.end();
-  const referenceDim = between("reference channels", channelsOf(groups, Role.reference), 1, MAX_REFERENCE_DIM);
+  const referenceDim = between(
+    "reference channels",
+    channelsOf(groups, Role.reference),
+    1,
+    MAX_REFERENCE_DIM,
+  );
   between("log scale channels", channelsOf(groups, Role.logScales), LOG_SCALES, LOG_SCALES);
   const residuals = channelsOf(groups, Role.residual);
   if (residuals) between("residual channels", residuals, residualDim, residualDim);
@@ -117,10 +133,12 @@ function readGroup(reader: FieldReader, before: GroupShape[], coupledPrimitives:
   }
   const context = before.map((_, j) => j).filter((j) => (bits >> (j + 1)) & 1);
   const residual = context.find((j) => before[j]!.role === Role.residual);
-  if (residual !== undefined) reader.refuse(`group ${index} takes group ${residual}, whose latents are residuals`);
+  if (residual !== undefined)
+    reader.refuse(`group ${index} takes group ${residual}, whose latents are residuals`);
   const width = role === Role.residual ? channels * coupledPrimitives : channels;
   const hasNetwork = bits !== 0;
-  if (!hasNetwork && width > MAX_TABLES) reader.refuse(`group ${index} needs ${width} tables, at most ${MAX_TABLES}`);
+  if (!hasNetwork && width > MAX_TABLES)
+    reader.refuse(`group ${index} needs ${width} tables, at most ${MAX_TABLES}`);
   const seesCoordinates = (bits & 1) === 1;
   const inputs = context.reduce((sum, j) => sum + before[j]!.channels, seesCoordinates ? 3 : 0);
   return { role, channels, seesCoordinates, context, steps, width, inputs, hasNetwork };

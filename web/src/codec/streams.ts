@@ -28,7 +28,13 @@ export function readStream(
   words.forEach((n, chunk) => {
     const [start, end] = [chunk * CHUNK_SYMBOLS, Math.min(count, (chunk + 1) * CHUNK_SYMBOLS)];
     const bytes = reader.slice(4 * n, "words of a chunk");
-    kernels.decodeChunk(bytes, tables, choices.subarray(start, end), symbols.subarray(start, end), reader.section);
+    kernels.decodeChunk(
+      bytes,
+      tables,
+      choices.subarray(start, end),
+      symbols.subarray(start, end),
+      reader.section,
+    );
   });
   const escapes = new FieldReader(reader.slice(escapeBytes, "escapes"), reader.section);
   readEscapes(escapes, tables, choices, symbols);

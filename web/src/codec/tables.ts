@@ -89,7 +89,8 @@ export function readTables(
     lowest.push(reader.signedVarint(`lowest of table ${t}`, -MAX_LOWEST, MAX_LOWEST));
   }
   let differences: Int32Array = new Int32Array(0);
-  if (count) [differences] = readArrays(reader, [entries.reduce((a, b) => a + b, 0)], kernels) as [Int32Array];
+  if (count)
+    [differences] = readArrays(reader, [entries.reduce((a, b) => a + b, 0)], kernels) as [Int32Array];
   reader.end();
   let at = 0;
   const tables = entries.map((size, t) => {
@@ -112,7 +113,8 @@ function frequenciesOf(differences: Int32Array, reader: FieldReader, table: numb
   for (let j = 0; j < m; j++) {
     // The escape has its own level, not a difference.
     level = j === m - 1 ? differences[j]! : level + differences[j]!;
-    if (level < 0 || level >= LEVELS) reader.refuse(`level ${level} in table ${table}, expected 0 to ${LEVELS - 1}`);
+    if (level < 0 || level >= LEVELS)
+      reader.refuse(`level ${level} in table ${table}, expected 0 to ${LEVELS - 1}`);
     if (level > largest) [largest, place] = [level, j];
     weights.push(MANTISSAS[level & 7]! * 2 ** (level >> 3));
   }

@@ -31,7 +31,8 @@ export interface Viewpoints {
 export function readViewpoints(payload: Uint8Array, name: string): Viewpoints {
   const reader = new FieldReader(payload, name);
   const length = (what: string, value: number): number => {
-    if (!(value > 0 && value < Infinity)) reader.refuse(`${what} is ${value}, expected a finite number above 0`);
+    if (!(value > 0 && value < Infinity))
+      reader.refuse(`${what} is ${value}, expected a finite number above 0`);
     return value;
   };
   const coordinate = (): number => {

@@ -39,8 +39,22 @@ export class CoupledMLP {
     this.residualRow = network.inputs - residualDim;
     this.ofAnchors = {
       rows: anchors,
-      entry: product(primitives.references, referenceDim, network.inputWeight, 0, network.width, network.inputBias),
-      skip: product(primitives.references, referenceDim, network.skipWeight, 0, network.outputs, network.outputBias),
+      entry: product(
+        primitives.references,
+        referenceDim,
+        network.inputWeight,
+        0,
+        network.width,
+        network.inputBias,
+      ),
+      skip: product(
+        primitives.references,
+        referenceDim,
+        network.skipWeight,
+        0,
+        network.outputs,
+        network.outputBias,
+      ),
     };
     const shared = primitives.sharedResiduals;
     this.ofSlots = shared && this.partOfResiduals(shared);
@@ -79,14 +93,26 @@ export class CoupledMLP {
   }
 
   /** `run` by a kernel: the anchors' parts, the view's included, are made here. */
-  private runPacked(mlp: PackedMLP, first: number, end: number, views: Float32Array | null, out: Float32Array): void {
+  private runPacked(
+    mlp: PackedMLP,
+    first: number,
+    end: number,
+    views: Float32Array | null,
+    out: Float32Array,
+  ): void {
     const { firstCoupled, slots, residuals, residualDim } = this.primitives;
     const { width, outputs, inputWeight, skipWeight } = this.network;
     const anchors = end - first;
     const entries = new Float32Array(anchors * mlp.width);
     const skips = new Float32Array(anchors * mlp.padded);
     const sums = new Float64Array(Math.max(width, outputs));
-    const fill = (to: Float32Array, stride: number, from: Float32Array, columns: number, weight: Float32Array): void => {
+    const fill = (
+      to: Float32Array,
+      stride: number,
+      from: Float32Array,
+      columns: number,
+      weight: Float32Array,
+    ): void => {
       for (let n = 0; n < anchors; n++) {
         for (let j = 0; j < columns; j++) sums[j] = from[(first + n) * columns + j]!;
         if (views) addProduct(views, 4 * (first + n), 4, weight, this.viewRow, columns, sums);
@@ -138,7 +164,8 @@ export class CoupledMLP {
         addProduct(views, 4 * n, 4, skipWeight, this.viewRow, outputs, skip);
       }
       const [from, to] = [firstCoupled[n]!, firstCoupled[n + 1]!];
-      const own = this.ofSlots ?? this.partOfResiduals(residuals!.subarray(from * residualDim, to * residualDim));
+      const own =
+        this.ofSlots ?? this.partOfResiduals(residuals!.subarray(from * residualDim, to * residualDim));
       for (let p = from; p < to; p++) {
         const row = this.ofSlots ? slots[p]! : p - from;
         for (let i = 0; i < width; i++) state[i] = leaky(entry[i]! + own.entry[row * width + i]!);

@@ -75,7 +75,8 @@ export function readHeadNetworks(scene: Scene): Heads {
   const shape = [scene.coupledPrimitives, scene.residualDim];
   const sharedResiduals = isShared ? tensor(SHARED_RESIDUALS, shape) : null;
   const unknown = [...scene.tensors.keys()].find((name) => !taken.has(name));
-  if (unknown !== undefined) throw new CorruptSection(`prediction heads: tensor ${unknown} is not of this layout`);
+  if (unknown !== undefined)
+    throw new CorruptSection(`prediction heads: tensor ${unknown} is not of this layout`);
   return { networks, sharedResiduals };
 }
 

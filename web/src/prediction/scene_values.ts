@@ -36,7 +36,8 @@ export function dequantize(scene: Scene, role: number): Float32Array {
   for (const { channels, steps, latents } of groups) {
     for (let c = 0; c < channels; c++) {
       const unit = (steps.length === 1 ? steps[0]! : steps[c]!) * 2 ** -FRACTION_BITS;
-      for (let row = 0; row < rows; row++) values[row * columns + column + c] = latents[row * channels + c]! * unit;
+      for (let row = 0; row < rows; row++)
+        values[row * columns + column + c] = latents[row * channels + c]! * unit;
     }
     column += channels;
   }
