@@ -1,6 +1,7 @@
 """A neural scene as plain splats: closed forms where the scene is simple, and our own pictures where it is not."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -100,6 +101,62 @@ def test_opacity_is_the_mean_over_what_reaches_the_primitive_where_it_is_not_dra
     assert once.splats.opacity_logits.sigmoid().item() == pytest.approx(0.6, abs=1e-5)
     assert twice.splats.opacity_logits.sigmoid().item() == pytest.approx(0.3, abs=0.03)
     torch.testing.assert_close(once.importance, twice.importance)
+
+
+class TwoBalls:
+    """Balls at the origin and a unit before it, one anchor each; look(camera) gives opacities [2] and colors [2, 3]."""
+
+    coupled = 2
+    background = world_offset = (0.0, 0.0, 0.0)
+    primitives = SimpleNamespace(anchor_index=torch.arange(2), positions=torch.zeros(2, 3))
+    geometry = (
+        torch.tensor([[0.0, 0, 0], [0, 0, -1]]),
+        torch.full((2, 3), 0.2),
+        torch.tensor([[1.0, 0, 0, 0]] * 2),
+    )
+    bounds = geometry[0], torch.ones(2)
+
+    def __init__(self, look) -> None:  # type: ignore[no-untyped-def]
+        self.look = look
+
+    def drawn(self, camera: Camera, visible: torch.Tensor) -> tuple[Gaussians, torch.Tensor]:
+        opacities, colors = self.look(camera)
+        rows = torch.nonzero(visible & (opacities > baking.CUTOFF)).view(-1)
+        means, scales, quaternions = (array[rows] for array in self.geometry)
+        return Gaussians(means, quaternions, scales, opacities[rows], colors[rows]), rows
+
+
+def along_z(z: float) -> Camera:
+    """Looks at the origin, from so far along z."""
+    pose = look_at(np.array([0, 0, z]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
+    return Camera(pose, 40.0, 40.0, 24.0, 24.0, 48, 48)
+
+
+def test_a_primitive_that_is_not_drawn_hides_next_to_nothing_of_those_behind_it() -> None:
+    front, behind = along_z(-4.0), along_z(4.0)
+
+    def look(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.tensor([0.2 if camera is front else 0.6, 0.0]), torch.zeros(2, 3)
+
+    baked = bake(TwoBalls(look), [front, behind], degree=0)  # type: ignore[arg-type]
+    assert len(baked.splats) == 1
+    assert baked.splats.opacity_logits.sigmoid().item() == pytest.approx(0.4, abs=0.01)
+
+
+def test_a_camera_counts_by_the_pixels_that_it_sees_of_a_primitive() -> None:
+    near, far = along_z(2.0), along_z(8.0)
+
+    def look(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.tensor([0.5, 0.0]), torch.full((2, 3), 0.9 if camera is near else 0.1)
+
+    def seen(*cameras: Camera) -> Baked:
+        return bake(TwoBalls(look), cameras, degree=0)  # type: ignore[arg-type]
+
+    weights = [seen(camera).importance.item() + baking.HIDDEN_WEIGHT for camera in (near, far)]
+    assert weights[0] > 8 * weights[1]
+    expected = (0.9 * weights[0] + 0.1 * weights[1]) / sum(weights)
+    color = 0.5 + 0.28209479 * seen(near, far).splats.dc
+    torch.testing.assert_close(color, torch.full((1, 3), expected), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("degree", range(4))

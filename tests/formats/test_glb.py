@@ -214,6 +214,7 @@ def accessor(gltf: dict[str, Any], name: str) -> dict[str, Any]:
         (edited(lambda g: g["bufferViews"][0].update(byteLength=1 << 40)), "beyond its part"),
         (edited(lambda g: g["buffers"][0].update(uri="other.bin")), "in another file"),
         (edited(lambda g: g.update(nodes=[{"children": [0]}])), "not a tree"),
+        (edited(lambda g: g.update(nodes=[{"children": [1, 1]}, {}])), "not a tree"),
         (edited(lambda g: g.update(nodes=[{}])), "in no scene"),
         (edited(lambda g: g["nodes"][0].update(scale=[1, 2, 1])), "stretches or mirrors"),
         (edited(lambda g: g["nodes"][0].update(scale=[-1, 1, 1])), "stretches or mirrors"),

@@ -144,6 +144,15 @@ def test_palettes_stay_within_sixteen_bits() -> None:
     assert [sog.palette_size(count) for count in (1, 5000, 10**6)] == [1024, 2500, 65_536]
 
 
+def test_colors_of_transparent_splats_are_kept(made, tmp_path: Path) -> None:
+    arrays = made(30, 0)
+    path = tmp_path / "a.sog"
+    path.write_bytes(sog.encoded(replace(arrays, opacity_logits=np.full(30, -30, np.float32))))
+    again = sog.read(path)
+    assert again.opacities.max() < 1e-5
+    np.testing.assert_allclose(again.dc, arrays.rows(sog.morton_order(arrays.means)).dc, atol=1e-4)
+
+
 def test_one_splat_is_enough(made, tmp_path: Path) -> None:
     path = tmp_path / "a.sog"
     path.write_bytes(sog.encoded(made(1)))

@@ -2,6 +2,7 @@
 
 import gzip
 import struct
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -167,6 +168,17 @@ def test_a_damaged_file_is_refused_with_what_is_wrong(
     with pytest.raises(SplatFileError, match=message) as caught:
         spz.read(path)
     assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_a_file_that_unpacks_to_more_than_it_says_is_not_unpacked_to_its_end(made, tmp_path: Path) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(gzip.decompress(spz.encoded(made(40))) + bytes(1 << 27)))
+    tracemalloc.start()
+    with pytest.raises(SplatFileError, match="the file holds more than"):
+        spz.read(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 24
 
 
 def test_extensions_after_the_splats_are_skipped(made, tmp_path: Path) -> None:
