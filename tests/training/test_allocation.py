@@ -32,7 +32,12 @@ def faults_of_an_array() -> int:
 def in_a_fresh_process(program: str) -> list[int]:
     """Numbers that a program prints; here the heap may hold what other tests have freed."""
     folder = str(Path(__file__).parent)
-    start = f"import sys; sys.path.insert(0, {folder!r})\nfrom test_allocation import *\n"
+    start = f"""
+import sys
+sys.path.insert(0, {folder!r})
+from test_allocation import faults_of_an_array
+from compgs.training.allocation import freed_memory_kept
+"""
     done = subprocess.run([sys.executable, "-c", start + program], capture_output=True, text=True, check=True)
     return [int(number) for number in done.stdout.split()]
 
