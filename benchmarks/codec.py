@@ -121,7 +121,7 @@ def parts(path: Path) -> dict[str, Any]:
     places = best("contexts of coordinates", lambda: coordinate_context(content.coordinates))
     _, index, tables = best(
         "residual network",
-        lambda: conditional_tables(residual, residual.prior, latents, places, content.mask),
+        lambda: conditional_tables(residual.shape, residual.prior, latents, places, content.mask),
     )
     index, symbols = index.ravel(), existing_symbols(residual, content.mask).ravel()
     stream = best("encode residual symbols", lambda: encode_symbols(symbols, index, tables))
@@ -155,7 +155,7 @@ def beside_constriction(path: Path) -> dict[str, Any]:
 
     content, latents = read_latents(path.read_bytes())
     group, places = content.group(Role.REFERENCE), coordinate_context(content.coordinates)
-    _, index, _ = conditional_tables(group, group.prior, latents, places, content.mask)
+    _, index, _ = conditional_tables(group.shape, group.prior, latents, places, content.mask)
     index = np.ascontiguousarray(index.ravel()[:CONSTRICTION_SYMBOLS])
     symbols = np.ascontiguousarray(group.symbols.ravel()[:CONSTRICTION_SYMBOLS])
     means, scales = np.zeros(len(index)), 2.0 ** (index / 12 - 5)

@@ -38,6 +38,7 @@ class PlainModel:
     bounds = (torch.tensor([[0.0, 0, 3], [0, 0, -3]]), torch.tensor([0.7, 0.7]))
     counts: ClassVar = {"splats": 50}
     most_gaussians = 50
+    viewpoints = ()
     asked: torch.Tensor | None = None
 
     def gaussians(self, camera: Camera, visible: torch.Tensor | None = None) -> Gaussians:

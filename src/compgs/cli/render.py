@@ -134,7 +134,7 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
 
     def way(self, model: "Renderable") -> "Sequence[tuple[str, Camera]]":
         """Along the file's cameras, or in a circle. Raises UsageError."""
-        cameras = getattr(model, "viewpoints", ())
+        cameras = model.viewpoints
         if self.path == "orbit" or (self.path is None and len(cameras) < 2):
             return self.circle(model)
         if len(cameras) < 2:

@@ -16,7 +16,7 @@ and other chains (several groups of one role, each given the one before; the anc
 written in the same format.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Literal
@@ -178,7 +178,7 @@ def network_context(shape: GroupShape, latents: Sequence[np.ndarray], places: np
 
 
 def conditional_tables(
-    group: Group | GroupShape,
+    shape: GroupShape,
     prior: IntegerNetwork | tuple[HyperTable, ...],
     latents: Sequence[np.ndarray],
     places: np.ndarray,  # [N, 3] `coordinate_context`
@@ -187,7 +187,6 @@ def conditional_tables(
     """What encoder and decoder know of a group before its symbols: means (Q12; None for a group with tables), index of
     each symbol's table, and the tables. [N, channels]; with RESIDUAL [P, channels].
     """
-    shape = group.shape if isinstance(group, Group) else group
     slots = mask if shape.role == Role.RESIDUAL else np.ones((len(mask), 1), np.bool_)
     if isinstance(prior, IntegerNetwork):
         context = network_context(shape, latents, places)
@@ -242,25 +241,36 @@ def _move_rows(slots, existing, mask, rows, gather):
             row += 1
 
 
+@dataclass(frozen=True)
+class CodedGroup:
+    """A group's symbols as a stream has them, with what both sides of the coder know; rows as in `Latents`."""
+
+    symbols: np.ndarray
+    table_index: np.ndarray  # of each symbol
+    tables: FrequencyTables
+    latents: np.ndarray
+
+
+def walk(groups: Sequence[Group], mask: np.ndarray, places: np.ndarray) -> Iterator[CodedGroup]:
+    """Along the chain of groups, each given the ones before. mask: [N, K]; places: [N, 3] `coordinate_context`."""
+    latents: list[np.ndarray] = []
+    for group in groups:
+        means, index, tables = conditional_tables(group.shape, group.prior, latents, places, mask)
+        symbols = existing_symbols(group, mask)
+        latents.append(fixed_point(symbols) if means is None else reconstruct(symbols, means))
+        yield CodedGroup(symbols, index, tables, latents[-1])
+
+
 def dequantize(content: FileContent) -> Latents:
     """Latents of all anchors, exactly as any other decoder gets them."""
     places = coordinate_context(content.coordinates)
-    latents: list[np.ndarray] = []
-    for group in content.groups:
-        means, _, _ = conditional_tables(group, group.prior, latents, places, content.mask)
-        symbols = existing_symbols(group, content.mask)
-        latents.append(fixed_point(symbols) if means is None else reconstruct(symbols, means))
-    return tuple(latents)
+    return tuple(coded.latents for coded in walk(content.groups, content.mask, places))
 
 
 def cross_entropy_bits(content: FileContent) -> list[float]:
     """Code length of each group under the file's own integer tables, escapes included: what a perfect coder needs."""
     places = coordinate_context(content.coordinates)
-    latents: list[np.ndarray] = []
-    bits = []
-    for group in content.groups:
-        means, index, tables = conditional_tables(group, group.prior, latents, places, content.mask)
-        symbols = existing_symbols(group, content.mask)
-        bits.append(float(sum(escape_bits(symbols.ravel(), index.ravel(), tables))))
-        latents.append(fixed_point(symbols) if means is None else reconstruct(symbols, means))
-    return bits
+    return [
+        float(sum(escape_bits(coded.symbols.ravel(), coded.table_index.ravel(), coded.tables)))
+        for coded in walk(content.groups, content.mask, places)
+    ]

@@ -15,9 +15,9 @@ from compgs.codec.content import (
     Group,
     Role,
     conditional_tables,
-    existing_symbols,
     fixed_point,
     reconstruct,
+    walk,
 )
 from compgs.codec.fields import FieldReader, varint
 from compgs.codec.format import LATENTS, MAX_ANCHORS, MAX_COUPLED_PRIMITIVES, MAX_SYMBOL, SECTION_NAMES
@@ -67,12 +67,10 @@ def encode_range(
 ) -> bytes:
     """The section of n anchors."""
     parts = [bytes([level]), varint(len(mask)), varint(int(mask.sum()))]
-    latents: list[np.ndarray] = []
-    for group in groups:
-        means, index, tables = conditional_tables(group, group.prior, latents, places, mask)
-        symbols = existing_symbols(group, mask)
-        parts.append(encode_symbols(symbols.ravel(), index.ravel(), tables))
-        latents.append(fixed_point(symbols) if means is None else reconstruct(symbols, means))
+    parts += [
+        encode_symbols(coded.symbols.ravel(), coded.table_index.ravel(), coded.tables)
+        for coded in walk(groups, mask, places)
+    ]
     return b"".join(parts)
 
 

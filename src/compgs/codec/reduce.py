@@ -63,7 +63,7 @@ def with_coarser_covariances(content: FileContent, ratio: float) -> FileContent:
     shape = replace(group.shape, steps=steps)
     coded = replace(group, shape=shape, prior=network)
     places = coordinate_context(content.coordinates)
-    means, _, _ = conditional_tables(coded, network, latents, places, content.mask)
+    means, _, _ = conditional_tables(shape, network, latents, places, content.mask)
     symbols = np.rint((latents[index] / ratios - means) / (1 << FRACTION_BITS)).astype(np.int32)
     groups = list(content.groups)
     groups[index] = replace(coded, symbols=symbols)

@@ -78,6 +78,7 @@ class SplatModel:
     background: tuple[float, float, float]  # RGB, 0 to 1
     # world units, float64: origin of the local frame
     world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    viewpoints: tuple[Camera, ...] = ()  # files of splats keep none
 
     @property
     def counts(self) -> Mapping[str, int]:

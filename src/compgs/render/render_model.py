@@ -39,6 +39,11 @@ class Renderable(Protocol):
         ...
 
     @property
+    def viewpoints(self) -> tuple[Camera, ...]:
+        """Cameras of the world to look from, the best first; none where the file keeps none."""
+        ...
+
+    @property
     def counts(self) -> Mapping[str, int]:
         """What there is how many of, by the names of `Results`: `splats`, or `anchors` and `coupled_primitives`."""
         ...
