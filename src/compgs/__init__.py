@@ -37,6 +37,8 @@ _HOME = {
     "CompGSError": "compgs.errors",
 }
 
+_TRAINS = ("train", "encode")  # of these, those that need torch
+
 __all__ = [
     "Camera",
     "CompGSError",
@@ -70,6 +72,10 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> object:
     if name not in _HOME:
         raise AttributeError(f"module 'compgs' has no attribute {name!r}")
+    if name in _TRAINS:
+        from compgs.extras import require
+
+        require("train", f"compgs.{name}")
     return getattr(importlib.import_module(_HOME[name]), name)
 
 

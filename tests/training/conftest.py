@@ -7,8 +7,8 @@ import torch
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig
 from compgs.gaussians import Gaussians
-from compgs.render import rasterize
 from compgs.scene.views import Points, Scene, View
+from compgs.tensors.rasterize import rasterize
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:

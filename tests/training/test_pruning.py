@@ -48,7 +48,7 @@ def test_an_anchor_that_no_view_misses_can_go_without_a_change(
     def distortion() -> float:
         rows = trainer.visible_anchors(view.camera)
         gaussians = trainer.predict(trainer.model.quantized(rows), rows, view.camera, True).gaussians
-        from compgs.render import rasterize
+        from compgs.tensors.rasterize import rasterize
 
         with torch.no_grad():
             return float(

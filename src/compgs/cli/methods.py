@@ -44,7 +44,7 @@ def _train_splats(*arguments: Any, **options: Any) -> "SplatModel":
 def _write_splats(model: "SplatModel", path: Path) -> int:
     from compgs.formats import write_ply
 
-    return write_ply(model.splats, path, world_offset=model.world_offset, overwrite=True)
+    return write_ply(model.splats, path, overwrite=True)
 
 
 METHODS = {

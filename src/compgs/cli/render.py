@@ -93,12 +93,11 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
         if self.cameras is not None and (self.scene or self.source):
             raise UsageError("both a scene and --cameras were given; give one")
         self.prepare()
-        import torch
+        from compgs.devices import chosen_device
 
         scene = read_scene(self.scene_source()) if self.scene or self.source else None
         views = self.given_views(scene)
-        device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
-        model = open_scene(self.file, device, scene.background if scene else BLACK)
+        model = open_scene(self.file, chosen_device(self.device), scene.background if scene else BLACK)
         if self.background is not None:
             model = model.over(self.background)
         self.render(model, views or self.way(model))
@@ -149,7 +148,7 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
         from compgs.evaluation.camera_path import orbit
 
         circle = orbit(
-            model.bounds[0].cpu().numpy(),
+            model.bounds[0],
             frames=self.frames,
             width=self.width,
             height=self.height,

@@ -28,6 +28,7 @@ from compgs.cli.settings import with_settings
 from compgs.cli.sizes import parse_cameras, parse_size
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.config import load_config
+from compgs.extras import require
 from compgs.outputs import check_output_folder, write_json
 
 if TYPE_CHECKING:
@@ -124,10 +125,11 @@ class Train(ComputingCommand, SceneOptions):
             )
         if self.resume and self.overwrite:
             raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
+        require("train", "training")
         folder = self.output
         check_output_folder(folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES)
         settings = self.settings(folder)
-        self.prepare()
+        self.prepare_training()
         if self.lpips:
             check_lpips()
         if self.resume:

@@ -5,14 +5,15 @@ import io
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
-import torch
 from PIL import Image
 
 from compgs import __version__, metrics
 from compgs.cameras import Camera
+from compgs.devices import chosen_device, device_name
 from compgs.errors import SceneError
 from compgs.evaluation.camera_path import camera_entry
 from compgs.evaluation.contact_sheet import contact_sheet
@@ -22,6 +23,9 @@ from compgs.outputs import check_output_folder, write_bytes, write_json
 from compgs.render import Renderable, render
 from compgs.scene import as_scene
 from compgs.scene.views import Scene, View
+
+if TYPE_CHECKING:
+    from compgs.devices import Device
 
 SHEET_ROWS = 4  # views on the contact sheet
 
@@ -33,7 +37,7 @@ def evaluate(
     output: str | Path | None = None,
     overwrite: bool = False,
     lpips: bool = False,
-    device: str | torch.device | None = None,
+    device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Results:
     """Open a file of any known format (`compgs.formats`) and compare its renderings with a scene's held-out views.
@@ -52,7 +56,7 @@ def evaluate(
         raise SceneError(
             f"{scene.name}: no view is held out, so there is nothing to evaluate on; load with hold-out"
         )
-    chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    chosen = chosen_device(device)
     model, first_seconds = _timed_decode(path, chosen, scene.background)
     model, decode_seconds = _timed_decode(path, chosen, scene.background)
 
@@ -114,11 +118,6 @@ def timed_render(model: Renderable, camera: Camera) -> tuple[np.ndarray, float]:
     return image, time.perf_counter() - start
 
 
-def device_name(device: torch.device) -> str:
-    """`cpu`, or the name of the GPU."""
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
-
-
 def write_evaluation(
     folder: Path, results: Results, views: tuple[View, ...], images: list[np.ndarray]
 ) -> None:
@@ -151,7 +150,7 @@ def encode_png(image: np.ndarray) -> bytes:
 
 
 def _timed_decode(
-    path: Path, device: torch.device, background: tuple[float, float, float]
+    path: Path, device: str, background: tuple[float, float, float]
 ) -> tuple[Renderable, float]:
     start = time.perf_counter()
     model = open_scene(path, device, background)

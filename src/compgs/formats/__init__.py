@@ -10,7 +10,7 @@
 | .splat | yes | no | 32, no harmonics |
 """
 
-from compgs.formats.arrays import SplatArrays, arrays_of
+from compgs.formats.arrays import SplatArrays
 from compgs.formats.ply import read_ply, write_ply
 from compgs.formats.registry import (
     FORMATS,
@@ -29,7 +29,6 @@ __all__ = [
     "WRITERS",
     "Format",
     "SplatArrays",
-    "arrays_of",
     "check_scene",
     "component_bytes",
     "encoded",

@@ -16,14 +16,18 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
+from compgs.devices import placed
 from compgs.errors import ConfigError
 from compgs.gaussians import Gaussians
 from compgs.losses import Target, photometric_loss
-from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
-from compgs.render import RasterResult, RasterSettings, rasterize, visible_mask
+from compgs.model.splats import SplatModel
+from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
+from compgs.tensors.rasterize import rasterize
+from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
+from compgs.tensors.visibility import visible_mask
 from compgs.training.checkpoint import (
     check_same_run,
     optimizer_tensors,
@@ -86,7 +90,8 @@ def train_splats(
     if profile is not None:
         profile.watch(trainer, PARTS, stations)
     trainer.run(path, on_progress)
-    return SplatModel(trainer.parameters.trained(), scene.background, trainer.world_offset)
+    splats = trainer.parameters.trained().arrays(trainer.world_offset)
+    return placed(SplatModel(splats, scene.background), chosen)
 
 
 class SplatTrainer:

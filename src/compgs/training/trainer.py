@@ -24,11 +24,13 @@ from compgs.losses import (
     scale_regularizer,
     scale_unit,
 )
-from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
-from compgs.render import RasterResult, RasterSettings, rasterize, visible_mask
+from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene, View
 from compgs.scene.world import local_scene
+from compgs.tensors.prediction import Prediction, camera_center, choosing_pays, predict
+from compgs.tensors.rasterize import rasterize
+from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
 from compgs.training.checkpoint import (
     Checkpoint,

@@ -2,7 +2,7 @@ import numba
 import pytest
 import torch
 
-from compgs.numerics.linear import linear
+from compgs.tensors.linear import linear
 
 
 def gradients(dtype, rows, inputs, outputs):

@@ -8,37 +8,38 @@ and time. `make_heads` chooses, once; names of parameters are those of docs/bits
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from compgs.gaussians import Gaussians
-from compgs.model.autograd import PairedPrediction
-from compgs.model.constants import VIEW_DIM
-from compgs.model.inference import HeadArrays, PairedArrays, SeparateArrays
-from compgs.model.prediction import Prediction, predict_by_torch, runs_in_kernels
-from compgs.model.primitives import Primitives
-from compgs.model.residual_mlp import ResidualMLP
-from compgs.numerics.linear import Reader
+from compgs.model.head_weights import NETWORKS, HeadDimensions, HeadWeights, Layout
+from compgs.tensors.autograd import PairedPrediction
+from compgs.tensors.linear import Reader
+from compgs.tensors.prediction import Prediction, predict_by_torch, runs_in_kernels
+from compgs.tensors.primitives import Primitives
+from compgs.tensors.residual_mlp import ResidualMLP
 
 OPACITY_BIAS = 0.15  # where opacity starts at or below zero no gradient flows
-
-
-@dataclass(frozen=True)
-class HeadDimensions:
-    """Channels of what the networks take, and of their hidden layers."""
-
-    reference: int
-    residual: int
-    width: int
 
 
 class PredictionHeads(nn.Module):
     """What both kinds of heads can do. `f` [A, reference_dim] are references of anchors, `seen` [A, reference_dim + 4]
     references and view embeddings, `index` [M] int64, ascending, rows of these for each coupled primitive.
     """
+
+    layout: Layout
+
+    def __init__(self, dimensions: HeadDimensions) -> None:
+        super().__init__()
+        self.dimensions = dimensions
+
+    def weights(self) -> HeadWeights:
+        """The same networks for rendering, as they are now; on the CPU they share the memory of the parameters."""
+        tensors = {name: p.detach().cpu().numpy() for name, p in self.named_parameters()}
+        return HeadWeights(self.layout, self.dimensions, tensors)
 
     @abstractmethod
     def raw_geometry(self, f: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
@@ -55,10 +56,6 @@ class PredictionHeads(nn.Module):
         """[M, 3] color of the `chosen` [M] int64 rows of `raw_appearance` (None: of all), whose residuals [M, G] and
         index [M] are given.
         """
-
-    @abstractmethod
-    def arrays(self) -> HeadArrays:
-        """The same networks for the kernels, as they are now."""
 
     @abstractmethod
     def pass_colors(self, mean: Tensor) -> None:
@@ -90,11 +87,11 @@ class PredictionHeads(nn.Module):
 class PairedHeads(PredictionHeads):
     """Two networks: geometry (10 outputs) and appearance (opacity and color)."""
 
+    layout = "paired"
+
     def __init__(self, dimensions: HeadDimensions) -> None:
-        super().__init__()
-        d = dimensions
-        self.geometry = ResidualMLP(d.reference, d.residual, 10, d.width, blocks=1)
-        self.appearance = ResidualMLP(d.reference + VIEW_DIM, d.residual, 4, d.width, blocks=1)
+        super().__init__(dimensions)
+        self.geometry, self.appearance = _networks(self.layout, dimensions)
         _start_visible(self.appearance)
 
     def raw_geometry(self, f: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
@@ -109,9 +106,6 @@ class PairedHeads(PredictionHeads):
         self, raw: Tensor, chosen: Tensor | None, seen: Tensor, residuals: Tensor, index: Tensor
     ) -> Tensor:
         return (raw if chosen is None else raw.index_select(0, chosen))[:, 1:4]
-
-    def arrays(self) -> PairedArrays:
-        return PairedArrays(self.geometry.arrays(), self.appearance.arrays())
 
     @torch.no_grad()
     def pass_colors(self, mean: Tensor) -> None:
@@ -136,14 +130,12 @@ class PairedHeads(PredictionHeads):
 class SeparateHeads(PredictionHeads):
     """Four networks, as in the paper: translation, covariance (scaling and quaternion), opacity, color."""
 
+    layout = "separate"
+
     def __init__(self, dimensions: HeadDimensions) -> None:
-        super().__init__()
-        d = dimensions
-        seen = d.reference + VIEW_DIM
-        self.translation = ResidualMLP(d.reference, d.residual, 3, d.width, blocks=1)
-        self.covariance = ResidualMLP(d.reference, d.residual, 7, d.width, blocks=1)
-        self.opacity = ResidualMLP(seen, d.residual, 1, d.width, blocks=1)
-        self.color = ResidualMLP(seen, d.residual, 3, d.width, blocks=2)
+        super().__init__(dimensions)
+        networks = _networks(self.layout, dimensions)
+        self.translation, self.covariance, self.opacity, self.color = networks
         _start_visible(self.opacity)
 
     def raw_geometry(self, f: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
@@ -160,10 +152,6 @@ class SeparateHeads(PredictionHeads):
         out: Tensor = self.color(seen, residuals, index)
         return out
 
-    def arrays(self) -> SeparateArrays:
-        networks = self.translation, self.covariance, self.opacity, self.color
-        return SeparateArrays(*(network.arrays() for network in networks))
-
     @torch.no_grad()
     def pass_colors(self, mean: Tensor) -> None:
         _pass_colors(self.color, 0, mean)
@@ -173,6 +161,23 @@ LAYOUTS: dict[str, type[PairedHeads] | type[SeparateHeads]] = {
     "paired": PairedHeads,
     "separate": SeparateHeads,
 }
+
+
+def _networks(layout: Layout, dimensions: HeadDimensions) -> list[ResidualMLP]:
+    """New ones, in the order of the file."""
+    d = dimensions
+    return [
+        ResidualMLP(shape.anchor_dim(d.reference), d.residual, shape.outputs, d.width, shape.blocks)
+        for shape in NETWORKS[layout].values()
+    ]
+
+
+def heads_of(weights: HeadWeights) -> PredictionHeads:
+    """Inverse of `PredictionHeads.weights`; without gradients, the weights are copied."""
+    heads = make_heads(weights.layout, weights.dimensions).requires_grad_(False)
+    for name, parameter in heads.named_parameters():
+        parameter.copy_(torch.from_numpy(np.array(weights.tensors[name])))
+    return heads
 
 
 def make_heads(layout: str, dimensions: HeadDimensions) -> PredictionHeads:

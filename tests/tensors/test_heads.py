@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from compgs.model import HeadDimensions, make_heads
-from compgs.model.heads import OPACITY_BIAS, PairedHeads, SeparateHeads
+from compgs.model import HeadDimensions
+from compgs.model.head_weights import weight_shapes
+from compgs.tensors.heads import OPACITY_BIAS, PairedHeads, SeparateHeads, heads_of, make_heads
 
 D, G, A, M = 12, 8, 30, 200
 LAYOUTS = ["paired", "separate"]
@@ -61,9 +62,20 @@ def test_raw_numbers_are_the_networks_outputs_side_by_side(layout):
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_arrays_of_the_heads_give_the_same_geometry(layout):
     heads, (f, _, g, index) = made(layout), inputs()
-    found = heads.arrays().raw_geometry(f.numpy(), g.numpy(), index.numpy())
+    found = heads.weights().arrays().raw_geometry(f.numpy(), g.numpy(), index.numpy())
     exact = heads.double().raw_geometry(f.double(), g.double(), index).numpy()
     assert np.abs(found - exact).max() < 1e-5 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_weights_have_the_shapes_that_files_must_have_and_make_the_same_heads(layout):
+    heads = made(layout)
+    weights = heads.weights()
+    found = {name: tensor.shape for name, tensor in weights.tensors.items()}
+    assert found == weight_shapes(layout, HeadDimensions(D, G, 16))
+    again = dict(heads_of(weights).named_parameters())
+    assert all(torch.equal(again[name], p) for name, p in heads.named_parameters())
+    assert not any(p.requires_grad for p in again.values())
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

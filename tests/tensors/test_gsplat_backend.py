@@ -8,8 +8,9 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.render import RasterSettings, rasterize
-from compgs.render.reference import rasterize_reference
+from compgs.render import RasterSettings
+from compgs.tensors.rasterize import rasterize
+from compgs.tensors.reference import rasterize_reference
 
 pytestmark = [
     pytest.mark.gpu,

@@ -17,10 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.model import prediction_kernels, residual_mlp_kernels
+from compgs.model import prediction_kernels
 from compgs.model.arrays import ALL_ROWS, AfterEntry
 from compgs.model.constants import OPACITY_CUTOFF
-from compgs.model.residual_mlp_kernels import CHUNKS, chunk_bounds
+from compgs.tensors import residual_mlp_kernels
+from compgs.tensors.residual_mlp_kernels import CHUNKS, chunk_bounds
 
 _Array = np.ndarray
 

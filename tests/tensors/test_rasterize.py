@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.render import RasterResult, RasterSettings, rasterize
+from compgs.render import RasterResult, RasterSettings
 from compgs.render.binning import TILE_HEIGHT, TILE_WIDTH
+from compgs.tensors.rasterize import rasterize
 
 BACKGROUND = RasterSettings(background=(0.2, 0.5, 0.9))
 FIELDS = [f.name for f in dataclasses.fields(Gaussians)]

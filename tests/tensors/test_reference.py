@@ -6,8 +6,8 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.render.reference import project, rasterize_reference, rotation_matrices
 from compgs.render.settings import RasterSettings, jacobian_limits
+from compgs.tensors.reference import project, rasterize_reference, rotation_matrices
 
 CAMERA = Camera(np.eye(4), 20.0, 22.0, 6.0, 5.0, 12, 10)
 

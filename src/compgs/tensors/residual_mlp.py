@@ -5,7 +5,8 @@
 
 `f` are the features of an anchor, `g` the residual embedding of one of its coupled primitives. What the first
 layer and the skip make of `f` is computed once per anchor. All weights are [in, out]; rows of `f` come before
-those of `g`. This is the readable version; on the CPU in float32 its twin `residual_mlp_kernels.py` does the work.
+those of `g`. This is the readable version. On the CPU in float32 its twins do the work: `residual_mlp_kernels.py` in
+training, `model/network_kernels.py` in rendering.
 """
 
 import math
@@ -13,10 +14,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-from compgs.model.arrays import MLPArrays
-from compgs.model.autograd import KernelMLP
 from compgs.model.constants import NEGATIVE_SLOPE
-from compgs.numerics.linear import linear
+from compgs.tensors.autograd import KernelMLP
+from compgs.tensors.linear import linear
 
 
 def _linear(inputs: int, outputs: int) -> tuple[nn.Parameter, nn.Parameter]:
@@ -78,11 +78,6 @@ class ResidualMLP(nn.Module):
         """
         anchor_entry, entry, bias = self._entry()
         return linear(anchor_features, anchor_entry, bias), self._after_entry(entry)
-
-    def arrays(self) -> MLPArrays:
-        """The weights as the kernels take them; without gradient."""
-        tensors = {name: p.detach().cpu().numpy() for name, p in self.named_parameters()}
-        return MLPArrays.of(tensors, self.anchor_dim)
 
     def _entry(self) -> tuple[Tensor, Tensor, Tensor]:
         """First layer and skip side by side: of the anchor, of the residual [inputs, width + outputs]; bias."""

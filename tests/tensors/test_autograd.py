@@ -4,8 +4,10 @@ import numba
 import pytest
 import torch
 
-from compgs.model import HeadDimensions, Primitives, make_heads, predict
-from compgs.model.primitives import every_slot
+from compgs.model import HeadDimensions
+from compgs.tensors.heads import make_heads
+from compgs.tensors.prediction import predict
+from compgs.tensors.primitives import Primitives, every_slot
 
 N, K, D, G = 300, 5, 12, 8
 CENTER = torch.tensor([0.3, -2.0, 5.0])

@@ -6,8 +6,8 @@
     mean_k = mean + reach t_k    scales_k = size sigmoid(S_k)    opacity_k = tanh(alpha_k)    color_k = sigmoid(c_k)
 
 Opacity is predicted first: a coupled primitive that is not seen needs nothing else. The networks are in `heads.py`.
-Everything runs on any device, in any precision, with gradients; on the CPU in float32 `prediction_kernels.py` is its
-twin, for training through `autograd.py` and for rendering through `inference.py`.
+Everything runs on any device, in any precision, with gradients; on the CPU in float32 its twin is
+`model/prediction_kernels.py`, for training through `autograd.py` and for rendering through `model/inference.py`.
 """
 
 import contextlib
@@ -21,10 +21,10 @@ from torch import Tensor
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.model.constants import OPACITY_CUTOFF, SMALLEST_DISTANCE
-from compgs.model.primitives import Primitives
+from compgs.tensors.primitives import Primitives
 
 if TYPE_CHECKING:
-    from compgs.model.heads import PredictionHeads
+    from compgs.tensors.heads import PredictionHeads
 
 
 @dataclass(frozen=True)

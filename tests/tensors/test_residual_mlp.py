@@ -3,8 +3,8 @@ import pytest
 import torch
 from torch import nn
 
-from compgs.model import residual_mlp_kernels
-from compgs.model.residual_mlp import ResidualMLP
+from compgs.tensors import residual_mlp_kernels
+from compgs.tensors.residual_mlp import ResidualMLP
 
 SLOPE = 2.0**-6
 

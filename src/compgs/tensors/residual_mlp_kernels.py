@@ -1,15 +1,10 @@
-"""The residual MLP on the CPU, fused: forward, and backward with recomputation. `residual_mlp.py` is its readable twin.
+"""The residual MLP in training, on the CPU, fused: forward, and backward with recomputation. `residual_mlp.py` is its
+readable twin, and explains the equations with `model/network_kernels.py`, the kernels of rendering.
 
-    first = residuals residual_entry + shared[anchor]
-    x     = leaky(first[:, :H])
-    x     = x + leaky(x weights1 + biases1) weights2 + biases2        once per block
-    out   = x output_weight + first[:, H:]
-
-`H` is the hidden width, `O` the outputs, `G` the residual channels, `B` the blocks; `shared` [A, H + O] is the anchors'
-part of the first layer and of the skip, biases included, computed once per anchor. Coupled primitives are taken ROWS at
-a time, so that all activations of a group stay in the core's cache; the products are BLAS calls on such groups
-(a whole pass takes 0.55 to 0.6 of the time of the same sums as loops vectorized by LLVM). Nothing is kept for
-the backward pass but the inputs: the activations are computed again, group by group.
+Coupled primitives are taken ROWS at a time, so that all activations of a group stay in the core's cache; the products
+are BLAS calls on such groups, which numba takes from scipy (a whole pass takes 0.55 to 0.6 of the time of the same sums
+as loops vectorized by LLVM). Nothing is kept for the backward pass but the inputs: the activations are computed again,
+group by group.
 
 Gradients of the weights are sums over all primitives: they are accumulated in CHUNKS parts and then added in
 order. Parts end where an anchor ends, so that each anchor's gradient is summed by one thread. The result
@@ -19,113 +14,46 @@ depends on neither the number of threads nor their timing.
 import numpy as np
 from numba import njit, prange
 
-from compgs.model.constants import NEGATIVE_SLOPE
+from compgs.model.network_kernels import (
+    FASTMATH,
+    ROWS,
+    SLOPE,
+    TASKS,
+    add_leaky,
+    add_shared,
+    add_two,
+    chosen_rows,
+    tiled,
+)
 
-ANCHORS = 128  # in a block
-ROWS = 128  # primitives in a group: all activations of a group fit into the second-level cache
 CHUNKS = 16  # partial sums of a weight gradient
 
-_SLOPE = np.float32(NEGATIVE_SLOPE)
-_FASTMATH = {"contract", "nsz", "arcp"}
 
-
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=FASTMATH, cache=True)
 def _leaky_gradient(d, x, n):
     """d[:n] *= the slope where the activation x was negative; leaky keeps the sign, so its output tells."""
     for i in range(n):
-        d[i] = d[i] if x[i] > np.float32(0) else _SLOPE * d[i]
+        d[i] = d[i] if x[i] > np.float32(0) else SLOPE * d[i]
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=FASTMATH, cache=True)
 def _add(x, y, n):
     """x[:n] += y[:n], flat."""
     for i in range(n):
         x[i] += y[i]
 
 
-@njit(fastmath=_FASTMATH, cache=True)
-def _add_leaky(x, bias, n):
-    """x[:n] = leaky(x + bias), flat."""
-    for i in range(n):
-        y = x[i] + bias[i]
-        x[i] = max(y, _SLOPE * y)
-
-
-@njit(fastmath=_FASTMATH, cache=True)
-def _add_two(x, y, bias, n):
-    """x[:n] = (x + bias) + y, flat."""
-    for i in range(n):
-        x[i] = x[i] + bias[i] + y[i]
-
-
-@njit(cache=True)
-def tiled(biases):
-    """[blocks, H] -> [blocks, ROWS * H]: a bias for each number of a group, so that adding it is one flat loop."""
-    H = biases.shape[1]
-    tiles = np.empty((len(biases), ROWS * H), np.float32)
-    for b in range(len(biases)):
-        for i in range(ROWS):
-            tiles[b, i * H : (i + 1) * H] = biases[b]
-    return tiles
-
-
-@njit(fastmath=_FASTMATH, cache=True)
-def _add_shared(first, shared, index, x):
-    """first[i] += shared[index[i]]; x [n, H] = leaky(its first columns)."""
-    H, F = x.shape[1], first.shape[1]
-    for i in range(len(index)):
-        anchor = index[i]
-        for j in range(H):
-            y = first[i, j] + shared[anchor, j]
-            x[i, j] = max(y, _SLOPE * y)
-        for j in range(H, F):
-            first[i, j] += shared[anchor, j]
-
-
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=FASTMATH, cache=True)
 def activations(residuals, index, shared, residual_entry, weights1, tiles1, weights2, tiles2, first, x, h):
     """One group: fills the last O columns of first [n, H + O], x [blocks + 1, ROWS, H] and h [blocks, ROWS, H]."""
     n, H = residuals.shape[0], weights1.shape[2]
     np.dot(residuals, residual_entry, first)
-    _add_shared(first, shared, index, x[0])
+    add_shared(first, shared, index, x[0])
     for b in range(weights1.shape[0]):
         np.dot(x[b, :n], weights1[b], h[b, :n])
-        _add_leaky(h[b].ravel(), tiles1[b], n * H)
+        add_leaky(h[b].ravel(), tiles1[b], n * H)
         np.dot(h[b, :n], weights2[b], x[b + 1, :n])
-        _add_two(x[b + 1].ravel(), x[b].ravel(), tiles2[b], n * H)
-
-
-@njit(parallel=True, cache=True)
-def begin(
-    features,  # [A, F] float32, of anchors
-    anchor_entry,  # [F, H + O]
-    entry_bias,  # [H + O]
-    shared,  # [A, H + O], written
-):
-    """The anchors' part of the first layer and of the skip, biases included."""
-    for block in prange((len(features) + ANCHORS - 1) // ANCHORS):
-        first, last = block * ANCHORS, min(len(features), (block + 1) * ANCHORS)
-        begin_block(features[first:last], anchor_entry, entry_bias, shared[first:last])
-
-
-@njit(cache=True)
-def begin_block(features, anchor_entry, entry_bias, shared):
-    """`begin` of one block of anchors."""
-    np.dot(features, anchor_entry, shared)
-    for i in range(len(features)):
-        for c in range(len(entry_bias)):
-            shared[i, c] += entry_bias[c]
-
-
-@njit(inline="always")
-def _chosen(residuals, rows, p, q, scratch):
-    """Residuals of a group: a part of the array, or gathered."""
-    if len(rows) == 0:
-        return residuals[p:q]
-    for i in range(q - p):
-        for c in range(residuals.shape[1]):
-            scratch[i, c] = residuals[rows[p + i], c]
-    return scratch[: q - p]
+        add_two(x[b + 1].ravel(), x[b].ravel(), tiles2[b], n * H)
 
 
 @njit(parallel=True, cache=True)
@@ -145,8 +73,7 @@ def forward(
     M, G, blocks = len(index), len(residual_entry), len(weights1)
     H, O = output_weight.shape
     groups = (M + ROWS - 1) // ROWS
-    # Several groups to a task: scratch memory is allocated once per task.
-    tasks = min(groups, 8 * CHUNKS)
+    tasks = min(groups, TASKS)
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
     for t in prange(tasks):
         own = np.empty((ROWS, G), np.float32)
@@ -156,7 +83,7 @@ def forward(
         for g in range(groups * t // tasks, groups * (t + 1) // tasks):
             p, q = g * ROWS, min(M, (g + 1) * ROWS)
             n = q - p
-            taken = _chosen(residuals, rows, p, q, own)
+            taken = chosen_rows(residuals, rows, p, q, own)
             activations(
                 taken, index[p:q], shared, residual_entry, weights1, tiles1, weights2, tiles2, first[:n], x, h
             )
@@ -179,7 +106,7 @@ def chunk_bounds(index, chunks):
     return bounds
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=FASTMATH, cache=True)
 def _first_gradient(first, dx, x, d, index, d_shared):
     """first [n, H + O] becomes its own gradient: from dx, of x = leaky(first[:, :H]), and d, of first[:, H:]. Each row
     is added to its anchor's in d_shared.
@@ -188,7 +115,7 @@ def _first_gradient(first, dx, x, d, index, d_shared):
     for i in range(len(d)):
         anchor = index[i]
         for j in range(H):
-            first[i, j] = dx[i, j] if x[i, j] > np.float32(0) else _SLOPE * dx[i, j]
+            first[i, j] = dx[i, j] if x[i, j] > np.float32(0) else SLOPE * dx[i, j]
         for j in range(O):
             first[i, H + j] = d[i, j]
         if len(d_shared) > 0:
@@ -243,7 +170,7 @@ def backward(
         for p in range(bounds[c], bounds[c + 1], ROWS):
             q = min(bounds[c + 1], p + ROWS)
             n = q - p
-            taken = _chosen(residuals, rows, p, q, own)
+            taken = chosen_rows(residuals, rows, p, q, own)
             activations(
                 taken, index[p:q], shared, residual_entry, weights1, tiles1, weights2, tiles2, first[:n], x, h
             )
