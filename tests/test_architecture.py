@@ -37,7 +37,7 @@ ALLOWED = {
     "cameras": set(),
     "config": {"errors", "presets"},
     "presets": set(),
-    "numerics": set(),
+    "numerics": {"compgs"},  # for `compgs.started`
     "scene": BASE,
     "render": BASE,
     "model": BASE,

@@ -13,6 +13,7 @@ from rich.table import Table
 from compgs import __version__
 from compgs.cli.arguments import command_name, parse_command
 from compgs.cli.command import Command
+from compgs.cli.compiling import say_when_compiling
 from compgs.cli.console import console, errors, show_whatever_can_be_shown
 from compgs.cli.decode import Decode
 from compgs.cli.demo_scene import DemoScene
@@ -83,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(command: Command) -> int:
     """The exit code; unexpected exceptions, which are our mistakes, keep their traceback."""
+    say_when_compiling()
     try:
         with ended_on_request():
             command.run()
