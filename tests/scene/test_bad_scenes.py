@@ -231,4 +231,4 @@ def test_usual_formats_are_read(tmp_path: Path, suffix: str) -> None:
     file = tmp_path / f"a.{suffix}"
     Image.new("RGB", (24, 16), (200, 100, 50)).save(file)
     assert image_size(file) == (24, 16)
-    assert np.abs(read_image(file, (0.0, 0.0, 0.0)).mean((0, 1)) - (200, 100, 50)).max() < 4
+    assert np.abs(read_image(file, None)[0].mean((0, 1)) - (200, 100, 50)).max() < 4
