@@ -21,6 +21,7 @@ from compgs.cli.encode import Encode
 from compgs.cli.evaluate import Evaluate
 from compgs.cli.export import Export
 from compgs.cli.info import Info
+from compgs.cli.reconstruct import Reconstruct
 from compgs.cli.render import Render
 from compgs.cli.serve import Serve
 from compgs.cli.train import Train
@@ -29,6 +30,7 @@ from compgs.errors import CompGSError
 from compgs.interrupt import Terminated, ended_on_request, held_back
 
 COMMANDS: tuple[type[Command], ...] = (
+    Reconstruct,
     Train,
     Encode,
     Decode,

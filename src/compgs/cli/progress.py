@@ -26,7 +26,7 @@ BAR_WIDTH = 12  # columns of the bar beside the words of a training
 def counting(what: str) -> Iterator[Callable[[int, int], None]]:
     """Yields `progress(done, total)`, for things that can be counted."""
     if not console.is_terminal:
-        yield _counting_lines(what)
+        yield counting_lines(what)
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as bars:
@@ -82,7 +82,7 @@ def time_left(status: "TrainingStatus") -> str:
     return f"{duration(seconds) if seconds >= 60 else f'{seconds} s'} left"
 
 
-def _counting_lines(what: str) -> Callable[[int, int], None]:
+def counting_lines(what: str) -> Callable[[int, int], None]:
     last = time.monotonic()
 
     def show(done: int, total: int) -> None:
