@@ -33,6 +33,7 @@ _HOME = {
     "decode": "compgs.codec",
     "render": "compgs.render",
     "evaluate": "compgs.evaluation",
+    "compare": "compgs.evaluation",
     "export": "compgs.exporting",
     "open_scene": "compgs.formats",
     "load_config": "compgs.config",
@@ -46,6 +47,7 @@ __all__ = [
     "CompGSError",
     "Gaussians",
     "__version__",
+    "compare",
     "decode",
     "encode",
     "evaluate",
@@ -62,6 +64,7 @@ if TYPE_CHECKING:
     from compgs.codec import decode, encode
     from compgs.config import load_config
     from compgs.errors import CompGSError
+    from compgs.evaluation import compare as compare
     from compgs.evaluation import evaluate as evaluate
     from compgs.exporting import export
     from compgs.formats import open_scene

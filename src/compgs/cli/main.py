@@ -13,6 +13,7 @@ from rich.table import Table
 from compgs import __version__
 from compgs.cli.arguments import command_name, parse_command
 from compgs.cli.command import Command
+from compgs.cli.compare import Compare
 from compgs.cli.compiling import say_when_compiling
 from compgs.cli.console import console, errors, show_whatever_can_be_shown
 from compgs.cli.decode import Decode
@@ -36,6 +37,7 @@ COMMANDS: tuple[type[Command], ...] = (
     Decode,
     Render,
     Evaluate,
+    Compare,
     Export,
     Serve,
     Info,
