@@ -25,7 +25,7 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
 
 def test_the_commands_are_there() -> None:
     assert NAMES == [
-        "train", "encode", "decode", "render", "evaluate", "compare", "export", "serve", "info", "demo-scene",
+        "reconstruct", "train", "encode", "decode", "render", "evaluate", "compare", "export", "serve", "info", "demo-scene",
     ]  # fmt: skip
 
 
@@ -160,7 +160,7 @@ DEMO = ["demo-scene", "scene"]
         ([*DEMO, "--seed", "-1"], "--seed -1: expected 0 to 2147483647"),
         (
             ["trian", "scene"],
-            "trian: there is no such command (did you mean train?); there are train, encode",
+            "trian: there is no such command (did you mean train?); there are reconstruct, train",
         ),
         (["--steps", "3"], "--steps: there is no such command"),
     ],
