@@ -30,6 +30,7 @@ _HOME = {
     "render": "compgs.render",
     "evaluate": "compgs.evaluation",
     "compare": "compgs.evaluation",
+    "report": "compgs.evaluation.reports",
     "export": "compgs.exporting",
     "open_scene": "compgs.formats",
     "load_config": "compgs.config",
@@ -52,6 +53,7 @@ __all__ = [
     "load_scene",
     "open_scene",
     "render",
+    "report",
     "train",
 ]
 
@@ -62,6 +64,7 @@ if TYPE_CHECKING:
     from compgs.errors import CompGSError
     from compgs.evaluation import compare as compare
     from compgs.evaluation import evaluate as evaluate
+    from compgs.evaluation.reports import report as report
     from compgs.exporting import export
     from compgs.formats import open_scene
     from compgs.gaussians import Gaussians
