@@ -11,7 +11,6 @@ from compgs.codec import decode, encode
 from compgs.config import Config, load_config
 from compgs.scene.views import Scene
 from compgs.training import trainer as trainer_module
-from compgs.training.checkpoint import load_checkpoint
 from compgs.training.decorrelation import (
     channel_rates,
     decorrelate,
@@ -235,7 +234,7 @@ def test_a_run_with_fewer_channels_continues_exactly(
     while first.step < 20:
         first.train_step()
     first.save(tmp_path / "checkpoint.safetensors")
-    second = Trainer.resumed(blob_scene, load_checkpoint(tmp_path / "checkpoint.safetensors"), config, CPU)
+    second = Trainer.resumed(blob_scene, tmp_path / "checkpoint.safetensors", config, CPU)
     for group in second.optimizer.param_groups:
         if group["name"] == "references":
             group["rates"] = (1e-3, 1e-3)

@@ -52,7 +52,9 @@ def test_an_anchor_that_no_view_misses_can_go_without_a_change(
 
         with torch.no_grad():
             return float(
-                photometric_loss(rasterize(gaussians, view.camera, trainer.settings).image, trainer.target(0))
+                photometric_loss(
+                    rasterize(gaussians, view.camera, trainer.settings).image, trainer.views.photograph(0)
+                )
             )
 
     before, anchors = distortion(), trainer.model.anchors
@@ -89,7 +91,7 @@ def test_pruning_that_falls_on_a_view_of_nothing_happens_all_the_same(
     lost = replace(view, camera=replace(view.camera, world_to_camera=aside))
     config = with_pruning(tiny_config, 0.1, (0.0,))
     trainer = Trainer(replace(blob_scene, train_views=(lost, *blob_scene.train_views[1:])), config, CPU)
-    trainer.order = [0]  # the first view
+    trainer.views.order = [0]  # the first view
     anchors = trainer.model.anchors
     trainer.train_step()
     assert trainer.model.anchors < anchors

@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from compgs.cli.usage import in_words_of_options
+
 if TYPE_CHECKING:
     from compgs.codec.reader import RangeInfo
     from compgs.evaluation.comparison import Comparison
@@ -29,6 +31,11 @@ def show_whatever_can_be_shown() -> None:
 def say(message: str) -> None:
     """One line for a person, markup taken literally."""
     console.print(escape(message))
+
+
+def warn(message: str) -> None:
+    """One line about what is probably not as somebody meant it, markup taken literally."""
+    errors.print(f"[bold yellow]warning:[/] {escape(message)}")
 
 
 def size(count: float) -> str:
@@ -115,6 +122,8 @@ def print_results(results: "Results") -> None:
     table.add_row("decoding", duration(results.decode_seconds))
     table.add_row("rendering a view", duration(results.render_seconds))
     views = f"{len(results.per_view)} held-out views, {results.width} x {results.height}"
+    for note in results.notes:
+        warn(in_words_of_options(note))
     say(f"{results.file} on {results.scene}: {views}, {results.device}, {results.threads} threads")
     console.print(table)
     console.print()
