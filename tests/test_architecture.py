@@ -37,7 +37,7 @@ ALLOWED = {
     "cameras": set(),
     "config": {"errors", "presets"},
     "presets": set(),
-    "numerics": set(),
+    "numerics": {"compgs"},  # for `compgs.started`
     "scene": BASE,
     "render": BASE,
     "model": BASE,
@@ -49,12 +49,13 @@ ALLOWED = {
     "codec": BASE | {"model", "entropy", "trained_model"},
     "formats": BASE | {"model", "render", "codec"},
     "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
+    "reconstruct": BASE | {"scene"},
     "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
     "viewer": BASE,
     "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},
     "cli": BASE
     | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "viewer"},
+    | {"trained_model", "exporting", "viewer", "reconstruct"},
     "__main__": BASE | {"cli"},
 }
 

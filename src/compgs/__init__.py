@@ -14,6 +14,7 @@ Names are resolved on first use, so that `import compgs` is instant and decoding
 
 import importlib
 import os
+import time
 from typing import TYPE_CHECKING
 
 # torch's OpenMP threads spin between parallel regions and take the cores from numba's: a training step
@@ -21,6 +22,9 @@ from typing import TYPE_CHECKING
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
+
+# Seconds since the epoch when the first source of the package was read: what changes later may not be what is loaded.
+started = time.time()
 
 _HOME = {
     "load_scene": "compgs.scene",

@@ -44,14 +44,14 @@ def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
 
 def test_photographs_without_poses_are_refused_with_the_command_that_helps(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
-    with pytest.raises(MissingSparseModel, match=r"no camera poses.*colmap automatic_reconstructor"):
+    with pytest.raises(MissingSparseModel, match=r"no camera poses.*compgs reconstruct"):
         load_scene(tmp_path)
 
 
 def test_the_command_that_helps_quotes_folders_with_spaces(tmp_path: Path) -> None:
     folder = tmp_path / "my garden"
     (folder / "images").mkdir(parents=True)
-    with pytest.raises(MissingSparseModel, match=r"--workspace_path '.*my garden' --image_path"):
+    with pytest.raises(MissingSparseModel, match=r"compgs reconstruct '.*my garden' -o SCENE"):
         load_scene(folder)
 
 

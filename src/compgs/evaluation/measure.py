@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from compgs.evaluation.contact_sheet import contact_sheet, striped
 from compgs.evaluation.fit import misfits
 from compgs.evaluation.results import Results, ViewResult
 from compgs.formats import component_bytes, open_scene
+from compgs.numerics.compiling import working_seconds
 from compgs.outputs import check_output_folder, write_bytes, write_json
 from compgs.render import Renderable, render
 from compgs.scene import as_scene
@@ -127,9 +127,9 @@ def counted_pixels(view: View) -> np.ndarray | None:
 
 def timed_render(model: Renderable, camera: Camera) -> tuple[np.ndarray, float]:
     """[H, W, 3] uint8, and the seconds it took until the image was there."""
-    start = time.perf_counter()
+    start = working_seconds()
     image = metrics.to_8bit(render(model, camera).image)
-    return image, time.perf_counter() - start
+    return image, working_seconds() - start
 
 
 def device_name(device: torch.device) -> str:
@@ -186,6 +186,6 @@ def encode_png(image: np.ndarray) -> bytes:
 def _timed_decode(
     path: Path, device: torch.device, background: tuple[float, float, float]
 ) -> tuple[Renderable, float]:
-    start = time.perf_counter()
+    start = working_seconds()
     model = open_scene(path, device, background)
-    return model, time.perf_counter() - start
+    return model, working_seconds() - start

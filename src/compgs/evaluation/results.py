@@ -15,7 +15,7 @@
 | components | bytes by component of the file; they sum to `bytes` |
 | anchors, coupled_primitives, splats | counts; null what the file does not have: splats are of all files but .cgs |
 | bits_per_anchor, bits_per_coupled_primitive, bits_per_splat | all bits of the file by each count, or null |
-| first_decode_seconds, decode_seconds | file to model: first in a process (loads kernels); again |
+| first_decode_seconds, decode_seconds | file to model: first in a process (loads kernels, compiles none); again |
 | render_seconds | median over the views, after one view to warm up |
 | device, threads | where it ran |
 | sha256 | of the file |

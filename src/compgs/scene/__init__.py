@@ -113,8 +113,7 @@ def _read_layout(folder: Path, images: str) -> Capture:
         raise MissingSparseModel(
             f"{folder}: no camera poses found; expected a COLMAP sparse model (cameras.bin, images.bin and "
             f"points3D.bin in sparse/0), transforms_train.json (Blender) or transforms.json (nerfstudio). "
-            f"For photographs alone, run: colmap automatic_reconstructor --workspace_path "
-            f"{shlex.quote(str(folder))} --image_path {shlex.quote(str(folder / images))}"
+            f"For photographs alone, or a video, run: compgs reconstruct {shlex.quote(str(folder))} -o SCENE"
         )
     return replace(capture, images=tuple(sorted(capture.images, key=lambda posed: posed.name)))
 

@@ -24,7 +24,7 @@ from compgs.scene.views import View
 FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "JPEG2000", "AVIF")
 
 # What Pillow raises for damaged files, besides OSError
-_DAMAGED = (OSError, ValueError, SyntaxError, EOFError, IndexError, MemoryError, Image.DecompressionBombError)
+DAMAGED = (OSError, ValueError, SyntaxError, EOFError, IndexError, MemoryError, Image.DecompressionBombError)
 
 MIN_SIDE = 4  # pixels: what downscaling must leave of an image
 
@@ -35,9 +35,9 @@ _Result = TypeVar("_Result")
 def image_size(file: Path) -> tuple[int, int]:
     """(width, height) in pixels, from the header alone. Raises UnreadableImage."""
     try:
-        with _opened(file) as image:
+        with open_image(file) as image:
             return image.size
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
 
 
@@ -147,17 +147,17 @@ def read_image(
     The orientation tag is ignored, as structure from motion ignores it: poses belong to the stored pixels.
     """
     try:
-        with _opened(file) as image:
+        with open_image(file) as image:
             image.load()
             return _rgb(image, background)
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
 
 
 def _read_mask(file: Path, photograph: Path, size: tuple[int, int]) -> np.ndarray:
     """[H, W] bool, of the file's own size, which must have the proportions of `size`. Raises UnreadableImage."""
     try:
-        with _opened(file) as image:
+        with open_image(file) as image:
             width, height = image.size
             if abs(width / size[0] - height / size[1]) > 1 / size[0] + 1 / size[1]:
                 raise UnreadableImage(
@@ -166,12 +166,12 @@ def _read_mask(file: Path, photograph: Path, size: tuple[int, int]) -> np.ndarra
                 )
             gray = image if image.mode.startswith("I") or image.mode == "F" else image.convert("L")
             return mask_of_brightness(np.asarray(gray))
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
 
 
-def _opened(file: Path) -> Image.Image:
-    """Of the formats that this Pillow has."""
+def open_image(file: Path) -> Image.Image:
+    """Opened, if of one of the FORMATS that this Pillow has; only the header is read. Raises what is in DAMAGED."""
     Image.init()
     return Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN])
 
