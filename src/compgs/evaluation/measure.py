@@ -35,13 +35,14 @@ def evaluate(
     lpips: bool = False,
     device: str | torch.device | None = None,
     progress: Callable[[int, int], None] | None = None,
+    method: str | None = None,
 ) -> Results:
     """Open a file of any known format (`compgs.formats`) and compare its renderings with a scene's held-out views.
 
     Metrics are of 8-bit images (`compgs.metrics`). A scene that is given as a folder is read as `load_scene(folder)`
     does. With `output`, a folder, `results.json` and `per_view.json` (their schema: `compgs.evaluation.results`),
     `cameras.json` (of the held-out views), `test/renders`, `test/gt` and `contact_sheet.png` are written there.
-    `progress(done, total)` is called after each view.
+    `progress(done, total)` is called after each view; `method` is noted: which one wrote the file.
 
     Raises BitstreamError, SplatFileError, SceneError if the scene holds no view out, OutputError.
     """
@@ -100,6 +101,7 @@ def evaluate(
         threads=numba.get_num_threads(),
         sha256=hashlib.sha256(data).hexdigest(),
         lpips_note=lpips_note,
+        method=method,
         per_view=tuple(rows),
     )
     if output is not None:

@@ -7,6 +7,7 @@
 | schema | "compgs results 1" |
 | compgs | version of the program that evaluated |
 | scene, file | names |
+| method | that wrote the file, if a run evaluated it; else null |
 | views, width, height | number of held-out views; pixels of the first |
 | psnr | dB, mean over the views; null if infinite: all renderings are perfect |
 | ssim | mean over the views |
@@ -64,6 +65,7 @@ class Results:
     threads: int
     sha256: str
     lpips_note: str | None  # why there is no LPIPS
+    method: str | None  # that wrote the file, where it is known
     per_view: tuple[ViewResult, ...]
 
     @property
@@ -106,6 +108,7 @@ class Results:
             "compgs": self.compgs,
             "scene": self.scene,
             "file": self.file,
+            "method": self.method,
             "views": len(self.per_view),
             "width": self.width,
             "height": self.height,
