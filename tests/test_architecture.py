@@ -38,7 +38,7 @@ ALLOWED = {
     "cameras": set(),
     "config": {"errors", "presets"},
     "presets": set(),
-    "numerics": set(),
+    "numerics": {"compgs"},  # for `compgs.started`
     "scene": BASE,
     "render": BASE,
     "model": BASE,
@@ -53,12 +53,13 @@ ALLOWED = {
     "methods": BASE
     | {"scene", "model", "entropy", "render", "losses", "metrics", "codec", "formats"}
     | {"training", "trained_model", "stored_weights"},
+    "reconstruct": BASE | {"scene"},
     "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
     "viewer": BASE,
     "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},
     "cli": BASE
     | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "viewer", "methods"},
+    | {"trained_model", "exporting", "viewer", "methods", "reconstruct"},
     "__main__": BASE | {"cli"},
 }
 

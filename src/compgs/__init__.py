@@ -14,6 +14,7 @@ Names are resolved on first use, so that `import compgs` is instant and decoding
 
 import importlib
 import os
+import time
 from typing import TYPE_CHECKING
 
 # torch's OpenMP threads spin between parallel regions and take the cores from numba's: a training step
@@ -22,6 +23,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
 
+# Seconds since the epoch when the first source of the package was read: what changes later may not be what is loaded.
+started = time.time()
+
 _HOME = {
     "load_scene": "compgs.scene",
     "train": "compgs.methods",
@@ -29,6 +33,7 @@ _HOME = {
     "decode": "compgs.codec",
     "render": "compgs.render",
     "evaluate": "compgs.evaluation",
+    "compare": "compgs.evaluation",
     "export": "compgs.exporting",
     "open_scene": "compgs.formats",
     "load_config": "compgs.config",
@@ -42,6 +47,7 @@ __all__ = [
     "CompGSError",
     "Gaussians",
     "__version__",
+    "compare",
     "decode",
     "encode",
     "evaluate",
@@ -58,6 +64,7 @@ if TYPE_CHECKING:
     from compgs.codec import decode, encode
     from compgs.config import load_config
     from compgs.errors import CompGSError
+    from compgs.evaluation import compare as compare
     from compgs.evaluation import evaluate as evaluate
     from compgs.exporting import export
     from compgs.formats import open_scene

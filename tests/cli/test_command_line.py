@@ -23,9 +23,9 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
     return code, captured.out, captured.err
 
 
-def test_the_nine_commands_are_there() -> None:
+def test_the_commands_are_there() -> None:
     assert NAMES == [
-        "train", "encode", "decode", "render", "evaluate", "export", "serve", "info", "demo-scene",
+        "train", "encode", "decode", "render", "evaluate", "compare", "export", "serve", "info", "demo-scene",
     ]  # fmt: skip
 
 
@@ -111,7 +111,7 @@ def test_options_with_numbers_are_found() -> None:
 def test_rubbish_in_place_of_a_number_is_named_with_its_option_and_what_was_expected(
     capsys: pytest.CaptureFixture[str], command: str, option: str, count: int
 ) -> None:
-    output = {"render": ["-o", "out"], "export": ["out.ply"]}.get(command, [])
+    output = {"render": ["-o", "out"], "export": ["out.ply"], "compare": ["other"]}.get(command, [])
     code, _, err = outcome(capsys, command, "something", *output, option, *["rubbish"] * count)
     assert code == 2
     assert_short(err)

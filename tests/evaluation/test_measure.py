@@ -24,6 +24,7 @@ class StandIn:
     """Renders a fixed image whatever the camera."""
 
     level: float  # 0 to 1
+    viewpoints: tuple[Camera, ...] = ()
 
     @property
     def counts(self) -> dict[str, int]:

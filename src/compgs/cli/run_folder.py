@@ -1,6 +1,7 @@
 """A run's folder: what `compgs train` leaves there, and `config.json`, which says how it came about."""
 
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -157,6 +158,51 @@ def load_settings(folder: Path) -> RunSettings:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path}: not the settings of a run ({error}); train anew") from error
+
+
+def file_and_run(path: Path) -> tuple[Path, RunSettings | None]:
+    """Of a run's folder, or of its file: the file, and the run's settings. Any other path stays as it is.
+
+    Raises CheckpointError for a folder of a run that has not written its file.
+    """
+    folder = path if path.is_dir() else path.parent
+    if not (folder / SETTINGS_NAME).is_file():
+        return path, None
+    if not path.is_dir():
+        with suppress(CheckpointError):
+            settings = load_settings(folder)
+            if path.name == _written_by(folder, settings).name:
+                return path, settings
+        return path, None
+    settings = load_settings(folder)
+    file = _written_by(folder, settings)
+    if not file.is_file():
+        command = f"compgs train -o {shlex.quote(str(folder))} --resume"
+        raise CheckpointError(
+            f"{folder}: the run has not written {file.name} yet; continue it with: {command}"
+        )
+    return file, settings
+
+
+def _written_by(folder: Path, settings: RunSettings) -> Path:
+    return folder / file_name(folder, METHODS[settings.method].suffix)
+
+
+def read_otherwise(begun: SceneSource, now: SceneSource) -> str:
+    """In what a scene is not read as when a run on it began, as options; empty if there is nothing."""
+    options = {"downscale": "-r", "test_every": "--test-every", "background": "--background"}
+    differing = [
+        f"{option} {_as_typed(getattr(begun, name))} (now {_as_typed(getattr(now, name))})"
+        for name, option in options.items()
+        if getattr(begun, name) != getattr(now, name)
+    ]
+    return ", ".join(differing + (["--no-eval"] if now.holdout and not begun.holdout else []))
+
+
+def _as_typed(value: Any) -> str:
+    if value is None:
+        return "not given"
+    return " ".join(f"{part:g}" for part in value) if isinstance(value, tuple) else str(value)
 
 
 def _known_method(name: str) -> str:

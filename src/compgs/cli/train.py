@@ -11,6 +11,7 @@ from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
 from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, check_lpips, one_scene
 from compgs.cli.console import duration, print_profile, print_results, say, size
+from compgs.cli.offer import with_poses
 from compgs.cli.progress import counting, training
 from compgs.cli.run_folder import (
     CHECKPOINT_NAME,
@@ -26,6 +27,7 @@ from compgs.cli.scenes import read_scene
 from compgs.cli.settings import check_settings_of, with_settings
 from compgs.cli.sizes import parse_cameras, parse_size
 from compgs.cli.usage import UsageError, settings_of_options
+from compgs.errors import MissingSparseModel
 from compgs.methods import METHODS, Method, settings_of, train
 from compgs.outputs import check_output_folder, write_json
 
@@ -142,7 +144,7 @@ class Train(ComputingCommand, SceneOptions):
             check_lpips()
         if self.resume:
             say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
-        scene = read_scene(settings.scene)
+        scene, settings = self.read(settings)
         with beginning(folder, settings, anew=not self.resume) as earlier:
             model = self.train(scene, settings, folder, earlier)
         method = METHODS[settings.method]
@@ -153,6 +155,16 @@ class Train(ComputingCommand, SceneOptions):
         self.evaluate(scene, path, folder, settings.method)
         if settings.config.training.target_bytes is not None:
             say_miss(folder, settings.config.training.target_bytes)
+
+    def read(self, settings: RunSettings) -> tuple["Scene", RunSettings]:
+        """The scene; where there are photographs without poses, of those that are found if the user agrees."""
+        try:
+            return read_scene(settings.scene), settings
+        except MissingSparseModel:
+            found = None if self.resume else with_poses(settings.scene)
+            if found is None:
+                raise
+        return read_scene(found), replace(settings, scene=found)
 
     def continues(self, folder: Path) -> bool:
         """There is a checkpoint to go on from, and it is asked for."""

@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,8 +15,10 @@ from compgs.cameras import Camera
 from compgs.errors import SceneError
 from compgs.evaluation.camera_path import camera_entry
 from compgs.evaluation.contact_sheet import contact_sheet
+from compgs.evaluation.fit import misfits
 from compgs.evaluation.results import Results, ViewResult
 from compgs.formats import component_bytes, open_scene
+from compgs.numerics.compiling import working_seconds
 from compgs.outputs import check_output_folder, write_bytes, write_json
 from compgs.render import Renderable, render
 from compgs.scene import as_scene
@@ -42,7 +43,9 @@ def evaluate(
     Metrics are of 8-bit images (`compgs.metrics`). A scene that is given as a folder is read as `load_scene(folder)`
     does. With `output`, a folder, `results.json` and `per_view.json` (their schema: `compgs.evaluation.results`),
     `cameras.json` (of the held-out views), `test/renders`, `test/gt` and `contact_sheet.png` are written there.
-    `progress(done, total)` is called after each view; `method` is noted: which one wrote the file.
+    `progress(done, total)` is called after each view; `method` is noted: which one wrote the file. Where the file tells
+    that it was made from another scene, or from views or sizes of images other than these, `notes` of the results say
+    so.
 
     Raises BitstreamError, SplatFileError, SceneError if the scene holds no view out, OutputError.
     """
@@ -54,8 +57,8 @@ def evaluate(
             f"{scene.name}: no view is held out, so there is nothing to evaluate on; load with hold-out"
         )
     chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    model, first_seconds = _timed_decode(path, chosen, scene.background)
-    model, decode_seconds = _timed_decode(path, chosen, scene.background)
+    model, first_seconds = timed_decode(path, chosen, scene.background)
+    model, decode_seconds = timed_decode(path, chosen, scene.background)
 
     timed_render(
         model, scene.test_views[0].camera
@@ -103,6 +106,7 @@ def evaluate(
         lpips_note=lpips_note,
         method=method,
         per_view=tuple(rows),
+        notes=misfits(model.viewpoints, scene),
     )
     if output is not None:
         write_evaluation(Path(output), results, scene.test_views, images)
@@ -111,9 +115,9 @@ def evaluate(
 
 def timed_render(model: Renderable, camera: Camera) -> tuple[np.ndarray, float]:
     """[H, W, 3] uint8, and the seconds it took until the image was there."""
-    start = time.perf_counter()
+    start = working_seconds()
     image = metrics.to_8bit(render(model, camera).image)
-    return image, time.perf_counter() - start
+    return image, working_seconds() - start
 
 
 def device_name(device: torch.device) -> str:
@@ -152,9 +156,10 @@ def encode_png(image: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def _timed_decode(
+def timed_decode(
     path: Path, device: torch.device, background: tuple[float, float, float]
 ) -> tuple[Renderable, float]:
-    start = time.perf_counter()
+    """The model, and the seconds from file to model."""
+    start = working_seconds()
     model = open_scene(path, device, background)
-    return model, time.perf_counter() - start
+    return model, working_seconds() - start

@@ -12,9 +12,10 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
+from compgs.numerics.compiled import njit
 from compgs.numerics.vector_sums import add_in_any_order
 
 WINDOW_SIZE = 11
@@ -82,7 +83,7 @@ def _across(S, i):
     return side + _G4 * (S[i + _u(12)] + S[i + _u(18)]) + _G5 * S[i + _u(15)]
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def _add_products(S, at, x, y, scale, weight):
     """Adds weight times (x, y, x x, y y, x y) to scratch rows 0 to 4, from element `at`."""
     at = _u(at)
@@ -98,7 +99,7 @@ def _add_products(S, at, x, y, scale, weight):
         S[o + _S4] += wa * b
 
 
-@njit(fastmath=_FASTMATH, cache=True, error_model="numpy")
+@njit(fastmath=_FASTMATH, error_model="numpy")
 def _similarity(S, n):
     """Sum of SSIM over n elements of a row; its gradient by m, xx and xy goes to scratch rows 5 to 7."""
     total = _ZERO
@@ -118,7 +119,7 @@ def _similarity(S, n):
     return total
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def _add_maps(S, at, d_m, d_xx, d_xy, weight):
     at = _u(at)
     for i in range(_u(d_m.size)):
@@ -128,7 +129,7 @@ def _add_maps(S, at, d_m, d_xx, d_xy, weight):
         S[o + _S2] += weight * d_xy[i]
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def _combine(S, x, y, scale, ssim_factor, l1_factor, d_x):
     """Gradient of one row of the loss."""
     for i in range(_u(x.size)):
@@ -140,7 +141,7 @@ def _combine(S, x, y, scale, ssim_factor, l1_factor, d_x):
         d_x[i] = ssim_factor * d + l1_factor * sign
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def _absolute_difference(x, y, scale):
     total = _ZERO
     for i in range(_u(x.size)):
@@ -148,7 +149,7 @@ def _absolute_difference(x, y, scale):
     return total
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def _compare(x, y, scale, maps, sums):
     """x, y [H, 3 W] -> sums [H, 2] of |x - y| and SSIM by row, maps [H, 3, 3 W] of the gradient of SSIM."""
     H, W = x.shape
@@ -171,7 +172,7 @@ def _compare(x, y, scale, maps, sums):
         sums[r, 1] = similarity
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def _compare_gradient(x, y, scale, maps, ssim_factor, l1_factor, d_x):
     """d_x [H, 3 W] = ssim_factor * dSSIM/dx + l1_factor * sign(x - y)."""
     H, W = x.shape
