@@ -30,6 +30,7 @@ ALLOWED = {
         "evaluation",
         "formats",
         "exporting",
+        "methods",
     },
     "errors": set(),
     "extras": {"errors"},
@@ -40,7 +41,7 @@ ALLOWED = {
     "cameras": set(),
     "config": {"errors", "presets"},
     "presets": set(),
-    "numerics": {"extras"},
+    "numerics": {"compgs", "extras"},  # `compgs.started`
     "scene": BASE,
     "render": BASE,
     "model": BASE,
@@ -51,15 +52,20 @@ ALLOWED = {
     "stored_weights": BASE | {"model", "entropy"},
     "trained_model": BASE | {"model", "entropy", "tensors", "devices", "stored_weights"},
     "codec": BASE | {"model", "devices", "entropy", "trained_model"},
-    "formats": BASE | {"model", "render", "devices", "codec"},
+    "formats": BASE
+    | {"model", "render", "devices", "codec", "methods"},  # up for a method's own files, which name it
     "training": BASE
     | {"scene", "render", "model", "tensors", "devices", "entropy", "losses", "metrics", "trained_model"},
+    "methods": BASE
+    | {"scene", "model", "entropy", "render", "tensors", "devices", "losses", "metrics", "codec", "formats"}
+    | {"training", "trained_model", "stored_weights"},
+    "reconstruct": BASE | {"scene"},
     "evaluation": BASE | {"scene", "render", "model", "devices", "metrics", "codec", "formats"},
     "viewer": BASE,
     "exporting": BASE | {"render", "model", "devices", "metrics", "formats", "evaluation", "viewer"},
     "cli": BASE
     | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "viewer"},
+    | {"trained_model", "exporting", "viewer", "methods", "reconstruct"},
     "__main__": BASE | {"cli"},
 }
 
@@ -134,10 +140,10 @@ def test_torch_scipy_and_safetensors_are_imported_where_training_is_and_nowhere_
 
 
 def test_what_only_looks_at_scenes_never_reaches_the_rooms_that_train() -> None:
-    """But through `devices`, which brings in CUDA, and `codec`, which has the encoder beside the decoder."""
+    """But through `devices` (CUDA), `codec` (the encoder stands beside the decoder) and `methods` (train and open)."""
     rooms = {name for name in TRAINS if "." not in name}
     assert {name for name in ALLOWED if ALLOWED[name] & rooms and name not in rooms} == {
-        "compgs", "devices", "codec", "cli",
+        "compgs", "devices", "codec", "methods", "cli",
     }  # fmt: skip
 
 
@@ -172,6 +178,12 @@ def test_formats_are_read_and_written_without_torch() -> None:
     loaded = modules_after("import compgs.formats")
     assert "compgs.formats.sog" in loaded
     assert not loaded & {"torch", "numba", "scipy"}
+
+
+def test_methods_are_named_without_what_trains_them() -> None:
+    loaded = modules_after("import compgs.methods; compgs.methods.settings_of('3dgs')")
+    assert "compgs.methods.splats" in loaded
+    assert not loaded & {"torch", "numba", "scipy", "compgs.training"}
 
 
 def test_the_command_line_starts_without_torch() -> None:

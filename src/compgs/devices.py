@@ -33,7 +33,7 @@ def check_device(name: str) -> None:
         raise ConfigError(f"device {name}: expected cpu or cuda")
     if kind == CPU:
         return
-    require("cuda", f"device {name}")
+    require("cuda", f"device {name}:")
     if int(number or 0) >= _gpus():
         raise ConfigError(
             f"device {name}: PyTorch finds {_gpus()} CUDA devices; use cpu, or install a CUDA build of PyTorch"

@@ -9,10 +9,10 @@ import torch
 
 import compgs.codec
 from compgs.cli.decode import Decode
-from compgs.cli.methods import METHODS
 from compgs.cli.render import Render
 from compgs.config import Config, ModelConfig
 from compgs.formats import read_ply
+from compgs.methods import write
 from compgs.model.splats import SplatArrays, SplatModel
 from compgs.trained_model import TrainedModel
 
@@ -49,5 +49,5 @@ def test_the_splats_file_of_a_run_is_in_world_coordinates(tmp_path: Path) -> Non
     quaternions = np.array([[1.0, 0, 0, 0]] * 2, np.float32)
     others = (np.zeros(shape, np.float32) for shape in ((2,), (2, 3), (2, 0, 3)))
     splats = SplatArrays(means, np.zeros((2, 3), np.float32), quaternions, *others, (1000.0, -64.0, 0.5))
-    METHODS["3dgs"].write(SplatModel(splats, (0.0, 0.0, 0.0)), tmp_path / "a.ply")
+    write(SplatModel(splats, (0.0, 0.0, 0.0)), tmp_path / "a.ply", method="3dgs")
     assert read_ply(tmp_path / "a.ply").means.tolist() == [[1001.0, -62.0, 3.5], [1000.0, -63.5, 0.25]]

@@ -1,14 +1,15 @@
 """What all commands have in common."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.run_folder import SceneSource
 from compgs.cli.usage import UsageError, check_range, settings_of_options
-from compgs.errors import ConfigError, MissingDependency
+from compgs.errors import ConfigError
 from compgs.extras import require
 
 NO_DEFAULT = ""  # instead of "(default: None)" in the help
@@ -70,6 +71,15 @@ class SceneFileArgument:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SceneFileOrRunArgument:
+    """Which file; one that a run has left brings its scene along."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE|RUN")]
+    """A .cgs file, or splats: .ply as 3DGS writes it, .spz, .sog (or its meta.json), .glb, .splat; or the folder of a
+    run, for its file, and its scene read as in training."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReadingOptions:
     """How a scene is read."""
 
@@ -116,6 +126,17 @@ class SceneOptions(ReadingOptions):
         """Raises UsageError if not exactly one scene was given."""
         return self.source_at(one_scene(self.scene, self.source), holdout=holdout)
 
+    def source_of_run(self, begun: SceneSource) -> SceneSource:
+        """As a run read its scene; what is given here goes before that. Raises UsageError."""
+        self.check_reading()
+        options = {field.name: field.default for field in dataclasses.fields(ReadingOptions)}
+        given: dict[str, Any] = {
+            name: getattr(self, name) for name in options if getattr(self, name) != options[name]
+        }
+        if self.scene or self.source:
+            given["path"] = str(one_scene(self.scene, self.source))
+        return dataclasses.replace(begun, **given)
+
 
 def one_scene(scene: Path | None, source: Path | None) -> Path:
     """SCENE or --source, whichever was given. Raises UsageError for none or two."""
@@ -149,8 +170,6 @@ def check_device(name: str) -> None:
 
     try:
         devices.check_device(name)
-    except MissingDependency:
-        raise
     except ConfigError as error:
-        kind = ConfigError if name.startswith("cuda") else UsageError
+        kind = type(error) if name.startswith("cuda") else UsageError
         raise kind(f"--{error}") from error

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,32 +25,59 @@ def tour(
     """`frames` cameras on a smooth way along the given ones, with the first one's field of view across.
 
     The shortest round tour (nearest neighbours, then 2-opt), without its longest leg where that is much longer than
-    the others. Positions by centripetal Catmull-Rom splines, rotations by spherical interpolation; equal pace.
-    Raises UnsupportedCamera for fewer than two cameras.
+    the others; see `way_through`. Raises UnsupportedCamera for fewer than two cameras.
     """
     if len(cameras) < 2:
         raise UnsupportedCamera(f"a way along cameras needs two of them, found {len(cameras)}")
     order, closed = tour_order(cameras)
-    chosen = [cameras[i] for i in order]
+    first = cameras[0]
+    across = first.fx / first.width
+    chosen = [replace(cameras[i], fx=across * cameras[i].width) for i in order]
+    way = way_through(chosen, frames=frames, width=width, height=height, closed=closed)
+    return [(f"tour {i}", camera) for i, camera in enumerate(way)]
+
+
+def way_through(
+    cameras: Sequence[Camera],  # at least 2, in this order
+    *,
+    frames: int,
+    width: int,
+    height: int,
+    closed: bool = False,
+) -> list[Camera]:
+    """`frames` cameras on a smooth way through the given ones, from first to last or, `closed`, on to the first.
+
+    Positions by centripetal Catmull-Rom splines, rotations by spherical interpolation, fields of view across by the
+    ratio of focal length and width. The pace is equal: all turning takes as long as all moving. Raises
+    UnsupportedCamera for fewer than two cameras.
+    """
+    if len(cameras) < 2:
+        raise UnsupportedCamera(f"a way along cameras needs two of them, found {len(cameras)}")
+    chosen = [*cameras, cameras[0]] if closed else list(cameras)
     centers = np.stack([camera.center for camera in chosen])
     rotations = _same_side(np.stack([quaternion_from_rotation(camera.rotation) for camera in chosen]))
-    if closed:
-        centers = np.concatenate([centers, centers[:1]])
-        rotations = _same_side(np.concatenate([rotations, rotations[:1]]))
-    legs = np.maximum(np.linalg.norm(np.diff(centers, axis=0), axis=1), 1e-9 * max(np.ptp(centers), 1e-30))
+    lenses = np.log([camera.fx / camera.width for camera in chosen])
+    legs = _legs(centers, rotations)
     knots = np.concatenate([[0.0], np.cumsum(legs)])
     times = np.linspace(0.0, knots[-1], frames + 1)[:-1] if closed else np.linspace(0.0, knots[-1], frames)
-    first = cameras[0]
-    focal = first.fx * width / first.width
     result = []
-    for i, time in enumerate(times):
+    for time in times:
         leg = min(int(np.searchsorted(knots, time, side="right")) - 1, len(legs) - 1)
         part = (time - knots[leg]) / legs[leg]
         center = _between(centers, leg, part, closed)
         rotation = rotation_from_quaternion(_slerp(rotations[leg], rotations[leg + 1], part))
+        focal = float(np.exp((1 - part) * lenses[leg] + part * lenses[leg + 1])) * width
         pose = rigid(rotation, -rotation @ center)
-        result.append((f"tour {i}", Camera(pose, focal, focal, width / 2, height / 2, width, height)))
+        result.append(Camera(pose, focal, focal, width / 2, height / 2, width, height))
     return result
+
+
+def _legs(centers: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """What each leg takes, above 0: its share of all distances and its share of all turning."""
+    moved = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    turned = np.arccos(np.clip((rotations[:-1] * rotations[1:]).sum(axis=1), -1.0, 1.0))
+    shares = sum(part / part.sum() for part in (moved, turned) if part.sum() > 0)
+    return np.maximum(shares, 1e-9)
 
 
 def tour_order(cameras: Sequence[Camera]) -> tuple[list[int], bool]:

@@ -12,9 +12,10 @@ BLAS (`tensors/residual_mlp_kernels.py`); these need nothing but numba.
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from compgs.model.constants import NEGATIVE_SLOPE
+from compgs.numerics.compiled import njit
 from compgs.numerics.products import multiply
 
 ANCHORS = 128  # in a block
@@ -25,7 +26,7 @@ SLOPE = np.float32(NEGATIVE_SLOPE)
 FASTMATH = {"contract", "nsz", "arcp"}
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def add_leaky(x, bias, n):
     """x[:n] = leaky(x + bias), flat."""
     for i in range(n):
@@ -33,14 +34,14 @@ def add_leaky(x, bias, n):
         x[i] = max(y, SLOPE * y)
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def add_two(x, y, bias, n):
     """x[:n] = (x + bias) + y, flat."""
     for i in range(n):
         x[i] = x[i] + bias[i] + y[i]
 
 
-@njit(cache=True)
+@njit
 def tiled(biases):
     """[blocks, H] -> [blocks, ROWS * H]: a bias for each number of a group, so that adding it is one flat loop."""
     H = biases.shape[1]
@@ -51,7 +52,7 @@ def tiled(biases):
     return tiles
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def add_shared(first, shared, index, x):
     """first[i] += shared[index[i]]; x [n, H] = leaky(its first columns)."""
     H, F = x.shape[1], first.shape[1]
@@ -75,7 +76,7 @@ def chosen_rows(residuals, rows, p, q, scratch):
     return scratch[: q - p]
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def hidden_layers(residuals, index, shared, residual_entry, weights1, tiles1, weights2, tiles2, first, x, h):
     """One group: fills the last O columns of first [n, H + O], x [blocks + 1, ROWS, H] and h [ROWS, H]."""
     n, H = residuals.shape[0], weights1.shape[2]
@@ -88,7 +89,7 @@ def hidden_layers(residuals, index, shared, residual_entry, weights1, tiles1, we
         add_two(x[b + 1].ravel(), x[b].ravel(), tiles2[b], n * H)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def begin(
     features,  # [A, F] float32, of anchors
     anchor_entry,  # [F, H + O]
@@ -101,7 +102,7 @@ def begin(
         begin_block(features[first:last], anchor_entry, entry_bias, shared[first:last])
 
 
-@njit(cache=True)
+@njit
 def begin_block(features, anchor_entry, entry_bias, shared):
     """`begin` of one block of anchors."""
     multiply(features, anchor_entry, shared)
@@ -110,7 +111,7 @@ def begin_block(features, anchor_entry, entry_bias, shared):
             shared[i, c] += entry_bias[c]
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def forward(
     residuals,  # [P, G] float32
     rows,  # [M] int64, ascending: those that are computed; [0]: all, M = P

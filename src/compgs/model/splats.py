@@ -99,6 +99,10 @@ class SplatModel:
     def most_gaussians(self) -> int:
         return len(self.splats)
 
+    def at(self, world_offset: tuple[float, float, float]) -> "SplatModel":
+        """The same with positions that count from another place."""
+        return replace(self, splats=replace(self.splats, world_offset=world_offset))
+
     def over(self, background: tuple[float, float, float]) -> "SplatModel":
         """The same over another background."""
         return replace(self, background=background)

@@ -12,9 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+
+from compgs.numerics.compiled import njit
 
 ROWS = 4  # of a block: with 16 columns each, its sums are half of the vector registers there are
 
@@ -76,7 +78,7 @@ _by_16, _by_8, _by_4, _by_1 = (_block(ROWS, columns) for columns in (16, 8, 4, 1
 _row_by_16, _row_by_8, _row_by_4, _row_by_1 = (_block(1, columns) for columns in (16, 8, 4, 1))
 
 
-@njit(cache=True)
+@njit
 def multiply(a, b, out):  # [N, K], [K, C], [N, C] float32; the columns of b and out lie side by side
     """out = a b."""
     columns = b.shape[1]

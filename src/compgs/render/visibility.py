@@ -14,9 +14,10 @@ ellipsoid.
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from compgs.cameras import Camera
+from compgs.numerics.compiled import njit
 from compgs.render.settings import RasterSettings, jacobian_limits
 
 BLOCK = 4096  # anchors
@@ -60,7 +61,7 @@ def frustum(camera: Camera, settings: RasterSettings) -> np.ndarray:
     return world
 
 
-@njit(parallel=True, fastmath={"contract", "nsz"}, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath={"contract", "nsz"}, error_model="numpy")
 def meet_frustum(positions, radii, planes, mask):
     n = positions.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):

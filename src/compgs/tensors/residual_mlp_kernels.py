@@ -12,7 +12,7 @@ depends on neither the number of threads nor their timing.
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from compgs.model.network_kernels import (
     FASTMATH,
@@ -25,25 +25,26 @@ from compgs.model.network_kernels import (
     chosen_rows,
     tiled,
 )
+from compgs.numerics.compiled import njit
 
 CHUNKS = 16  # partial sums of a weight gradient
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def _leaky_gradient(d, x, n):
     """d[:n] *= the slope where the activation x was negative; leaky keeps the sign, so its output tells."""
     for i in range(n):
         d[i] = d[i] if x[i] > np.float32(0) else SLOPE * d[i]
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def _add(x, y, n):
     """x[:n] += y[:n], flat."""
     for i in range(n):
         x[i] += y[i]
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def activations(residuals, index, shared, residual_entry, weights1, tiles1, weights2, tiles2, first, x, h):
     """One group: fills the last O columns of first [n, H + O], x [blocks + 1, ROWS, H] and h [blocks, ROWS, H]."""
     n, H = residuals.shape[0], weights1.shape[2]
@@ -56,7 +57,7 @@ def activations(residuals, index, shared, residual_entry, weights1, tiles1, weig
         add_two(x[b + 1].ravel(), x[b].ravel(), tiles2[b], n * H)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def forward(
     residuals,  # [P, G] float32
     rows,  # [M] int64, ascending: those that are computed; [0]: all, M = P
@@ -93,7 +94,7 @@ def forward(
                     out[p + i, j] += first[i, H + j]
 
 
-@njit(cache=True)
+@njit
 def chunk_bounds(index, chunks):
     """[chunks + 1] rows of equal parts, moved forward to where the next anchor begins."""
     M = len(index)
@@ -106,7 +107,7 @@ def chunk_bounds(index, chunks):
     return bounds
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def _first_gradient(first, dx, x, d, index, d_shared):
     """first [n, H + O] becomes its own gradient: from dx, of x = leaky(first[:, :H]), and d, of first[:, H:]. Each row
     is added to its anchor's in d_shared.
@@ -123,7 +124,7 @@ def _first_gradient(first, dx, x, d, index, d_shared):
                 d_shared[anchor, j] += first[i, j]
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def backward(
     residuals,
     rows,

@@ -14,8 +14,10 @@ def window_on(dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.as_tensor(window(), dtype=dtype, device=device)
 
 
-def ssim(x: Tensor, y: Tensor) -> Tensor:
-    """Mean SSIM of [H, W, 3] images: plain torch, any device and type."""
+def ssim(x: Tensor, y: Tensor, counted: Tensor | None = None) -> Tensor:
+    """Mean SSIM of [H, W, 3] images over the pixels of a mask [H, W] bool, or all: plain torch, any device and type."""
+    if counted is not None:
+        x, y = (image * counted[:, :, None] for image in (x, y))
     taps = window_on(x.dtype, x.device)
 
     def blur(maps: Tensor) -> Tensor:  # [N, 1, H, W]
@@ -25,4 +27,5 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
     maps = torch.cat([x, y, x * x, y * y, x * y], 2).permute(2, 0, 1)[:, None]
     m, n, xx, yy, xy = blur(maps).view(5, 3, *x.shape[:2])
     similarity = (2 * m * n + C1) * (2 * (xy - m * n) + C2)
-    return (similarity / ((m * m + n * n + C1) * (xx - m * m + yy - n * n + C2))).mean()
+    similarity = similarity / ((m * m + n * n + C1) * (xx - m * m + yy - n * n + C2))
+    return similarity.mean() if counted is None else similarity[:, counted].mean()
