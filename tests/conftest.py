@@ -1,5 +1,6 @@
-"""What tests of several rooms need: Ctrl-C that is heard, and a small .cgs file."""
+"""What tests of several rooms need: Ctrl-C that is heard, a small .cgs file, and a browser."""
 
+import shutil
 import signal
 from pathlib import Path
 
@@ -47,3 +48,12 @@ def tiny_cgs(tmp_path: Path, cgs_bytes: bytes) -> Path:
     path = tmp_path / "tiny.cgs"
     path.write_bytes(cgs_bytes)
     return path
+
+
+@pytest.fixture(scope="session")
+def browser() -> str:
+    """Path of a Chromium; tests that need one are skipped where there is none."""
+    for name in ("chromium", "chromium-browser", "google-chrome"):
+        if path := shutil.which(name):
+            return path
+    pytest.skip("no Chromium is on PATH")
