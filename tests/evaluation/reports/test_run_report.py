@@ -10,7 +10,7 @@ from PIL import Image
 
 import compgs
 from compgs.errors import ConfigError, OutputError, ReportError
-from compgs.evaluation.reports import Run, report, run_pictures
+from compgs.evaluation.reports import Column, Run, Table, report, run_pictures, run_report
 from compgs.evaluation.reports.summary import points_of
 
 from .conftest import HEIGHT, PHOTOGRAPHS, WIDTH, Maker
@@ -198,6 +198,33 @@ def test_runs_that_are_known_already_need_no_folder(tmp_path: Path, make_run: Ma
     assert [point.rate for point in points_of(known)] == ["a", "b"]
     mixed = report([*known, tmp_path / "runs" / "a"], tmp_path / "mixed.html")
     assert mixed.runs == 3 and mixed.scenes == 2
+
+
+def test_scenes_have_their_means_first_and_long_tables_are_folded_or_left_to_the_csv(
+    make_run: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = [make_run("a", bytes=1000), make_run("b", bytes=3000, scene="room")]
+    report(folders, tmp_path / "few.html")
+    page = page_of(tmp_path / "few.html")
+    assert list(page.tables)[:2] == ["means", "results"]
+    assert page.row("means", "compgs default")["bytes"] == "2,000"
+    assert page.tags.count("details") == 2  # components and views
+    monkeypatch.setattr(run_report, "OPEN_ROWS", 1)
+    monkeypatch.setattr(run_report, "MOST_ROWS", 3)
+    report(folders, tmp_path / "many.html")
+    page = page_of(tmp_path / "many.html")
+    assert page.tags.count("details") == 1 and "Every scene" in page.text
+    assert set(page.tables) == {"means", "results"}
+    assert "Views: 4 rows, in many_views.csv." in page.text
+
+
+def test_tables_of_others_stand_behind_those_of_the_runs(make_run: Maker, tmp_path: Path) -> None:
+    columns = (Column("method", "method"), Column("psnr", "PSNR, dB", ".2f"))
+    published = Table("published", "As published", columns, (("Somebody", 27.256),))
+    written = report([make_run("a")], tmp_path / "r.html", others=[published])
+    assert written.tables[-1] is published
+    assert page_of(tmp_path / "r.html").row("published", "Somebody")["PSNR, dB"] == "27.26"
+    assert (tmp_path / "r_published.csv").read_text().splitlines()[1] == "Somebody,27.256"
 
 
 def test_an_existing_report_or_table_is_kept_unless_asked(make_run: Maker, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from compgs.evaluation.reports import summary
 from compgs.evaluation.reports.runs import read_runs
 from compgs.evaluation.reports.summary import (
     bd_rate_table,
+    means_table,
     points_of,
     results_table,
     views_table,
@@ -59,7 +60,7 @@ def test_sizes_are_compared_with_plain_3dgs_of_the_same_scene(make_run: Maker) -
         make_run("other", scene="room"),
     ]
     rows = records(results_table(points_of(read_runs(folders)[0])))
-    assert [(row["scene"], row["ratio"]) for row in rows[:3]] == [
+    assert [(row["scene"], row["ratio"]) for row in rows] == [
         ("garden", 1.0),
         ("garden", 80.0),
         ("room", None),
@@ -72,9 +73,12 @@ def test_means_over_scenes_are_of_what_every_scene_has(make_run: Maker) -> None:
         make_run("b", bytes=3000, psnr=(30.0,), scene="room"),
         make_run("c", bytes=500, lmbda=0.1),
     ]
-    rows = records(results_table(points_of(read_runs(folders)[0])))
-    (mean,) = [row for row in rows if row["scene"] == summary.ALL_SCENES]
+    points = points_of(read_runs(folders)[0])
+    table = means_table(points)
+    assert table is not None and table.title == "Means of 2 scenes"
+    (mean,) = records(table)
     assert (mean["rate"], mean["bytes"], mean["psnr"], mean["seeds"]) == ("lambda 0.001", 2000, 25.0, 1)
+    assert means_table([point for point in points if point.scene == "garden"]) is None
 
 
 def curve(make_run: Maker, preset: str, factor: float, scene: str = "garden") -> list[object]:
