@@ -11,6 +11,8 @@ from compgs.evaluation.reports.runs import Run
 from compgs.evaluation.reports.tables import Column, Spread, Table, Value
 
 PLAIN_3DGS = "3dgs"  # method that sizes are compared with
+# Numbers that seeds change; of the others the mean says enough.
+WITH_SPREAD = ("psnr", "ssim", "lpips", "bytes")
 ALL_SCENES = "mean of all scenes"
 MEASURES = (("psnr", "PSNR", ".2f"), ("ssim", "SSIM", ".4f"))
 
@@ -118,7 +120,9 @@ def _row(point: Point, points: Sequence[Point]) -> tuple[Value, ...]:
     size = point.mean("bytes")
     ratio = plain[-1] / size if plain and plain[-1] and size else None
     known: dict[str, Value] = {"seeds": len(point.runs), "ratio": ratio}
-    numbers = [known[c.key] if c.key in known else point.spread(c.key) for c in NUMBERS]
+    for key in (column.key for column in NUMBERS if column.key not in known):
+        known[key] = point.spread(key) if key in WITH_SPREAD else point.mean(key)
+    numbers = [known[column.key] for column in NUMBERS]
     return (point.scene, point.method, point.rate or None, *numbers)
 
 
