@@ -56,7 +56,7 @@ def make_run(tmp_path: Path) -> Maker:
             chosen = {"training.lmbda": lmbda, "training.seed": seed, **(settings or {})}
             for key, value in chosen.items():
                 section, _, field = key.partition(".")
-                values[section][field] = value
+                values.setdefault(section, {})[field] = value
             write(folder / "config.json", {"method": method, "preset": preset, "settings": values})
             steps = {"step": [10, 20, 30], "psnr": [10.0, 15.0, 16.0], "estimated_bytes": [2000, 1500, 1100]}
             training: dict[str, Any] = {"seconds": 100.0 + seed, "resumed": False, "lmbda": lmbda}

@@ -38,6 +38,23 @@ def test_other_methods_have_no_lambda_unless_their_training_knows_one(make_run: 
     assert names([plain, quick]) == [("garden", "3dgs", "", 0), ("garden", "3dgs quick", "lambda 0.5", 0)]
 
 
+def test_presets_and_settings_of_another_methods_own_are_its_rates(make_run: Maker) -> None:
+    folders = [
+        make_run("a", method="c3dgs", preset="small"),
+        make_run("b", method="c3dgs", preset="default", settings={"c3dgs.codebook": 64}),
+        make_run("c", method="c3dgs", preset="default", settings={"c3dgs.codebook": 4096}),
+        make_run("d", method="c3dgs", preset="quick"),
+    ]
+    for folder in folders:
+        (folder / "training.json").write_text("{}")
+    assert [(method, rate) for _, method, rate, _ in names(folders)] == [
+        ("c3dgs", "small"),
+        ("c3dgs", "c3dgs.codebook=64"),
+        ("c3dgs", "c3dgs.codebook=4096"),
+        ("c3dgs quick", ""),
+    ]
+
+
 def test_runs_of_one_preset_with_different_settings_are_not_one_curve(make_run: Maker) -> None:
     folders = [
         make_run("a", settings={"training.steps": 500}),
