@@ -28,7 +28,7 @@ started = time.time()
 
 _HOME = {
     "load_scene": "compgs.scene",
-    "train": "compgs.training",
+    "train": "compgs.methods",
     "encode": "compgs.codec",
     "decode": "compgs.codec",
     "render": "compgs.render",
@@ -66,12 +66,14 @@ if TYPE_CHECKING:
     from compgs.exporting import export
     from compgs.formats import open_scene
     from compgs.gaussians import Gaussians
+    from compgs.methods import train
     from compgs.render import render
     from compgs.scene import load_scene
-    from compgs.training import train
 
 
 def __getattr__(name: str) -> object:
+    if name == "methods":
+        return importlib.import_module("compgs.methods")
     if name not in _HOME:
         raise AttributeError(f"module 'compgs' has no attribute {name!r}")
     return getattr(importlib.import_module(_HOME[name]), name)

@@ -68,6 +68,7 @@ class Evaluate(ComputingCommand, SceneOptions, SceneFileOrRunArgument):
                 overwrite=self.overwrite,
                 lpips=self.lpips,
                 device=self.device,
+                method=run.method if run else None,
                 progress=progress,
             )
         say("")

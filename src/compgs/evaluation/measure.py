@@ -36,6 +36,7 @@ def evaluate(
     lpips: bool = False,
     device: str | torch.device | None = None,
     progress: Callable[[int, int], None] | None = None,
+    method: str | None = None,
 ) -> Results:
     """Open a file of any known format (`compgs.formats`) and compare its renderings with a scene's held-out views.
 
@@ -43,8 +44,9 @@ def evaluate(
     does. With `output`, a folder, `results.json` and `per_view.json` (their schema: `compgs.evaluation.results`),
     `cameras.json` (of the held-out views), `test/renders`, `test/gt`, `test/masks` (of views that have one: white where
     a pixel counts) and `contact_sheet.png` are written there.
-    `progress(done, total)` is called after each view. Where the file tells that it was made from another scene, or from
-    views or sizes of images other than these, `notes` of the results say so.
+    `progress(done, total)` is called after each view; `method` is noted: which one wrote the file. Where the file tells
+    that it was made from another scene, or from views or sizes of images other than these, `notes` of the results say
+    so.
 
     Pixels that a view's mask leaves out do not count.
 
@@ -107,6 +109,7 @@ def evaluate(
         threads=numba.get_num_threads(),
         sha256=hashlib.sha256(data).hexdigest(),
         lpips_note=lpips_note,
+        method=method,
         per_view=tuple(rows),
         notes=misfits(model.viewpoints, scene),
     )
