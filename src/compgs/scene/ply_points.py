@@ -41,7 +41,8 @@ def read_ply_points(file: Path) -> Points:
         else:
             vertices = np.frombuffer(body, np.dtype([(n, order + t) for n, t in columns]), count)
             rows = {name: vertices[name] for name, _ in columns}
-        positions = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # what is no number is left out below
+            positions = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
     except (ValueError, KeyError, IndexError) as error:
         raise SceneError(
             f"{file}: vertices with x, y, z were expected ({error}); export them again"
