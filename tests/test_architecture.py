@@ -50,10 +50,10 @@ ALLOWED = {
     "codec": BASE | {"model", "entropy", "trained_model"},
     "formats": BASE | {"model", "render", "codec", "methods"},  # up for a method's own files, which name it
     "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
-    "reconstruct": BASE | {"scene"},
     "methods": BASE
     | {"scene", "model", "entropy", "render", "losses", "metrics", "codec", "formats"}
     | {"training", "trained_model", "stored_weights"},
+    "reconstruct": BASE | {"scene"},
     "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
     "viewer": BASE,
     "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},

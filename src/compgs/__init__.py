@@ -33,6 +33,8 @@ _HOME = {
     "decode": "compgs.codec",
     "render": "compgs.render",
     "evaluate": "compgs.evaluation",
+    "compare": "compgs.evaluation",
+    "report": "compgs.evaluation.reports",
     "export": "compgs.exporting",
     "open_scene": "compgs.formats",
     "load_config": "compgs.config",
@@ -46,6 +48,7 @@ __all__ = [
     "CompGSError",
     "Gaussians",
     "__version__",
+    "compare",
     "decode",
     "encode",
     "evaluate",
@@ -54,6 +57,7 @@ __all__ = [
     "load_scene",
     "open_scene",
     "render",
+    "report",
     "train",
 ]
 
@@ -62,7 +66,9 @@ if TYPE_CHECKING:
     from compgs.codec import decode, encode
     from compgs.config import load_config
     from compgs.errors import CompGSError
+    from compgs.evaluation import compare as compare
     from compgs.evaluation import evaluate as evaluate
+    from compgs.evaluation.reports import report as report
     from compgs.exporting import export
     from compgs.formats import open_scene
     from compgs.gaussians import Gaussians

@@ -17,8 +17,9 @@ A metric over views is the mean of the views' metrics.
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Literal
 
 import numpy as np
@@ -27,6 +28,8 @@ from torch import Tensor
 
 from compgs.errors import MissingDependency, install_line
 from compgs.numerics.ssim import l1_and_ssim
+
+SAME_PICTURE = 100.0  # dB, about what one level in one pixel of one channel comes to
 
 # Distance of two batches [1, 3, H, W] in [-1, 1].
 LpipsNetwork = Callable[[Tensor, Tensor], Tensor]
@@ -62,6 +65,11 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     counted = difference if mask is None else difference[mask]
     error = float(np.mean(np.square(counted), dtype=np.float64))
     return math.inf if error == 0.0 else 10.0 * math.log10(255.0**2 / error)
+
+
+def mean_psnr(values: Sequence[float]) -> float:
+    """dB, of pictures that may be equal: those count as SAME_PICTURE, unless all are; then it is infinite."""
+    return math.inf if min(values) == math.inf else fmean(min(value, SAME_PICTURE) for value in values)
 
 
 def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from compgs import metrics
 from compgs.cameras import Camera
 from compgs.errors import OutputError, SceneError
 from compgs.evaluation import evaluate as package_evaluate
@@ -63,11 +64,20 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_psnr_is_the_mean_over_views_of_a_closed_form(file: Path) -> None:
-    results = evaluate(file, make_scene([101, 110]), device="cpu")
-    psnrs = [20 * math.log10(255 / 1), 20 * math.log10(255 / 10)]
+    results = evaluate(file, make_scene([101, 110, 104, 155]), device="cpu")
+    psnrs = [20 * math.log10(255 / error) for error in (1, 10, 4, 55)]
     assert [view.psnr for view in results.per_view] == pytest.approx(psnrs, abs=1e-6)
-    assert results.psnr == pytest.approx(sum(psnrs) / 2, abs=1e-6)
-    assert 0 < results.ssim <= 1
+    assert results.psnr == pytest.approx(sum(psnrs) / 4, abs=1e-6)
+
+
+def test_ssim_is_the_mean_over_views(file: Path) -> None:
+    scene = make_scene([101, 110, 50, 20])
+    results = evaluate(file, scene, device="cpu")
+    flat = np.full_like(scene.test_views[0].image, 100)
+    each = [metrics.ssim(flat, view.image) for view in scene.test_views]
+    assert [view.ssim for view in results.per_view] == pytest.approx(each)
+    assert results.ssim == pytest.approx(sum(each) / 4, abs=1e-9)
+    assert max(each) - results.ssim > 0.05 < abs(results.ssim - np.median(each))
 
 
 def test_rates_are_of_the_whole_file(file: Path) -> None:

@@ -13,6 +13,7 @@ from rich.table import Table
 from compgs import __version__
 from compgs.cli.arguments import command_name, parse_command
 from compgs.cli.command import Command
+from compgs.cli.compare import Compare
 from compgs.cli.compiling import say_when_compiling
 from compgs.cli.console import console, errors, show_whatever_can_be_shown
 from compgs.cli.decode import Decode
@@ -23,6 +24,7 @@ from compgs.cli.export import Export
 from compgs.cli.info import Info
 from compgs.cli.reconstruct import Reconstruct
 from compgs.cli.render import Render
+from compgs.cli.report import Report
 from compgs.cli.serve import Serve
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError, in_words_of_options
@@ -36,6 +38,8 @@ COMMANDS: tuple[type[Command], ...] = (
     Decode,
     Render,
     Evaluate,
+    Compare,
+    Report,
     Export,
     Serve,
     Info,

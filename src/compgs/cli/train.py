@@ -237,8 +237,9 @@ class Train(ComputingCommand, SceneOptions):
 
     def train(self, scene: "Scene", settings: RunSettings, folder: Path, earlier: EarlierRun | None) -> Any:
         """The method's model. Raises KeyboardInterrupt, with what to do next, when the user stops it."""
-        from compgs.training import StepProfile
+        from compgs.training import History, StepProfile
 
+        history = History()
         profile = StepProfile() if self.profile else None
         last: TrainingStatus | None = None
         continues = self.continues(folder)
@@ -249,6 +250,7 @@ class Train(ComputingCommand, SceneOptions):
                 def on_progress(status: "TrainingStatus") -> None:
                     nonlocal last
                     last = status
+                    history.add(status)
                     if earlier is not None:
                         earlier.look()
                     show(status)
@@ -282,6 +284,7 @@ class Train(ComputingCommand, SceneOptions):
                     "seconds_per_step": last.seconds_per_step,
                     "resumed": continues,
                     **({"milliseconds_per_step": profile.milliseconds()} if profile else {}),
+                    "curve": history.curve(),
                 },
             )
         say(f"trained in {duration(seconds)}")

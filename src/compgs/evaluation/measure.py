@@ -65,8 +65,8 @@ def evaluate(
             f"{scene.name}: no view is held out, so there is nothing to evaluate on; load with hold-out"
         )
     chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    model, first_seconds = _timed_decode(path, chosen, scene.background)
-    model, decode_seconds = _timed_decode(path, chosen, scene.background)
+    model, first_seconds = timed_decode(path, chosen, scene.background)
+    model, decode_seconds = timed_decode(path, chosen, scene.background)
 
     timed_render(
         model, scene.test_views[0].camera
@@ -203,9 +203,10 @@ def encode_png(image: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def _timed_decode(
+def timed_decode(
     path: Path, device: torch.device, background: tuple[float, float, float]
 ) -> tuple[Renderable, float]:
+    """The model, and the seconds from file to model."""
     start = working_seconds()
     model = open_scene(path, device, background)
     return model, working_seconds() - start
