@@ -154,7 +154,7 @@ class Train(ComputingCommand, SceneOptions):
         start = time.perf_counter()
         written = method.write(model, path, settings.config)
         say(f"{path}: {size(written)}, written in {duration(time.perf_counter() - start)}")
-        self.evaluate(scene, path, folder, settings.method)
+        self.evaluate(scene, path, folder, settings)
         if settings.config.training.target_bytes is not None:
             say_miss(folder, settings.config.training.target_bytes)
 
@@ -294,7 +294,7 @@ class Train(ComputingCommand, SceneOptions):
             print_profile(profile.milliseconds())
         return model
 
-    def evaluate(self, scene: "Scene", file: Path, folder: Path, method: str) -> None:
+    def evaluate(self, scene: "Scene", file: Path, folder: Path, settings: RunSettings) -> None:
         if not scene.test_views:
             say("no views are held out (--no-eval): the file was not evaluated")
             return
@@ -309,7 +309,8 @@ class Train(ComputingCommand, SceneOptions):
                 lpips=self.lpips,
                 device=self.device,
                 progress=progress,
-                method=method,
+                method=settings.method,
+                exposure=settings.config.training.exposure,
             )
         say("")
         print_results(results)
