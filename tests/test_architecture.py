@@ -50,7 +50,7 @@ ALLOWED = {
     "formats": BASE | {"model", "render", "codec"},
     "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
     "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
-    "viewer": BASE,
+    "viewer": BASE | {"render", "model", "metrics", "codec", "formats", "evaluation"},
     "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},
     "cli": BASE
     | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}

@@ -25,7 +25,7 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
 
 def test_the_nine_commands_are_there() -> None:
     assert NAMES == [
-        "train", "encode", "decode", "render", "evaluate", "export", "serve", "info", "demo-scene",
+        "train", "encode", "decode", "render", "evaluate", "view", "export", "serve", "info", "demo-scene",
     ]  # fmt: skip
 
 

@@ -24,6 +24,7 @@ from compgs.cli.render import Render
 from compgs.cli.serve import Serve
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError, in_words_of_options
+from compgs.cli.view import View
 from compgs.errors import CompGSError
 from compgs.interrupt import Terminated, ended_on_request, held_back
 
@@ -33,6 +34,7 @@ COMMANDS: tuple[type[Command], ...] = (
     Decode,
     Render,
     Evaluate,
+    View,
     Export,
     Serve,
     Info,
