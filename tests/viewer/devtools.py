@@ -76,6 +76,7 @@ def tab(browser: str, folder: Path, width: int, height: int) -> Iterator[Page]:
     flags = [
         *("--remote-debugging-port=0", f"--window-size={width},{height}", f"--user-data-dir={folder}"),
         "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+        "--disable-features=BackForwardCache",  # a page that was left is gone
     ]
     process = subprocess.Popen(
         [browser, *FLAGS, *flags, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
