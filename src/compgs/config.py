@@ -271,23 +271,25 @@ def _section(kind: type, values: dict[str, Any], place: str) -> Any:
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
-def config_from_dict(values: dict[str, Any], place: str = "settings") -> Config:
-    """Inverse of `Config.to_dict`. Raises ConfigError on unknown names or values out of range."""
-    hints = typing.get_type_hints(Config)
+def config_from_dict(values: dict[str, Any], place: str = "settings", kind: type[Config] = Config) -> Config:
+    """Inverse of `Config.to_dict`, of a Config that may have more sections. Raises ConfigError on unknown names or
+    values out of range.
+    """
+    hints = typing.get_type_hints(kind)
     unknown = sorted(set(values) - set(hints))
     if unknown:
         raise ConfigError(f"{place}: unknown section {unknown[0]!r}; known: {', '.join(hints)}")
-    config = Config(**{k: _section(hints[k], v, f"{place}: [{k}]") for k, v in values.items()})
+    config = kind(**{k: _section(hints[k], v, f"{place}: [{k}]") for k, v in values.items()})
     check_config(config)
     return config
 
 
-def load_config(preset: str = "default") -> Config:
+def load_config(preset: str = "default", kind: type[Config] = Config) -> Config:
     """The settings of a preset: `default`, `paper` or `quick`. Raises ConfigError for any other name."""
     if preset not in PRESETS:
         raise ConfigError(f"preset {preset!r} does not exist; there are {', '.join(PRESETS)}")
     file = resources.files("compgs.presets") / f"{preset}.toml"
-    return config_from_dict(tomllib.loads(file.read_text(encoding="utf-8")), f"preset {preset}")
+    return config_from_dict(tomllib.loads(file.read_text(encoding="utf-8")), f"preset {preset}", kind)
 
 
 def check_config(config: Config) -> None:

@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean
 
 import torch
 
@@ -33,7 +32,6 @@ from compgs.outputs import check_output_file, write_bytes
 from compgs.render import Renderable, render
 
 HTML = "html"
-SAME_PICTURE = 100.0  # dB, about what one level in one pixel of one channel comes to
 FITTED_CAMERAS = 96  # of baking; fewer than the coefficients leave colors between them to chance
 COMPARED_CAMERAS = 12  # between the file's own, beside those: baking saw none of them
 LONGEST_SIDE = 800  # pixels, of cameras that baking looks through
@@ -56,8 +54,8 @@ class Exported:
 
     @property
     def mean(self) -> float:
-        """dB, of the cameras; equal pictures count as SAME_PICTURE, unless all are."""
-        return self.worst if self.worst == float("inf") else fmean(min(p, SAME_PICTURE) for p in self.psnr)
+        """dB, of the cameras, as `metrics.mean_psnr` has it."""
+        return metrics.mean_psnr(self.psnr)
 
     @property
     def worst(self) -> float:

@@ -64,6 +64,40 @@ def write_bytes(path: Path, data: bytes) -> None:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
+@contextlib.contextmanager
+def filling(folder: Path) -> Iterator[Path]:
+    """Yields a new folder; what is in it when the block is done takes its place in `folder`, which is made if need be.
+
+    Until then `folder` is as it was, and if the block fails, it stays so. Files of the same names are replaced.
+    Numbered pictures (`00007.png`) that are beside new ones and not among them are of something earlier: they go.
+    Raises OutputError.
+    """
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:40]}.", dir=folder.parent) as temporary:
+            yield Path(temporary)
+            _move_files(Path(temporary), folder)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error.strerror or error})") from error
+
+
+def _move_files(source: Path, target: Path) -> None:
+    files = sorted(path for path in source.rglob("*") if path.is_file())
+    for file in files:
+        place = target / file.relative_to(source)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(file, place)
+    new = {target / file.relative_to(source) for file in files}
+    for parent in {path.parent for path in new if _numbered(path)}:
+        for old in parent.iterdir():
+            if _numbered(old) and old not in new:
+                _remove(old)
+
+
+def _numbered(path: Path) -> bool:
+    return path.suffix == ".png" and len(path.stem) == 5 and path.stem.isdigit()
+
+
 def write_json(path: Path, content: dict[str, Any] | list[Any]) -> None:
     """JSON for programs, indented for people. JSON has no infinity and no not-a-number: those become null."""
     text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)

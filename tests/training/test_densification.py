@@ -1,9 +1,11 @@
 import itertools
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from compgs.cameras import Camera
 from compgs.config import SplatConfig
 from compgs.model.splats import Splats
 from compgs.render.reference import rotation_matrices
@@ -14,7 +16,12 @@ from compgs.training.densification import (
     rotate,
     split,
 )
-from compgs.training.splat_parameters import SplatParameters, make_splat_optimizer, reset_opacities
+from compgs.training.splat_parameters import (
+    SplatParameters,
+    make_splat_optimizer,
+    replace_splats,
+    reset_opacities,
+)
 
 CPU = torch.device("cpu")
 EXTENT = 4.0
@@ -51,7 +58,11 @@ def act(parameters, optimizer, gradient: list[float], config=None, *, remove_lar
     control = DensityControl(config or SplatConfig(), EXTENT, len(parameters), CPU)
     control.gradient[:] = torch.tensor(gradient) * 3
     control.seen[:] = 3
-    control.act(parameters, optimizer, torch.Generator().manual_seed(0), remove_large=remove_large)
+    splats, chance = parameters.trained(), torch.Generator().manual_seed(0)
+    kept, added, origins = control.chosen(splats, splats, chance, remove_large=remove_large)
+    assert torch.equal(added.dc, splats.dc[origins])
+    replace_splats(parameters, optimizer, kept, added)
+    control.forget(len(parameters))
     assert len(control.gradient) == len(control.seen) == len(parameters)
     assert not control.gradient.any() and not control.seen.any()
 
@@ -75,6 +86,27 @@ def test_small_splats_are_cloned_and_large_ones_split_where_the_image_pulls():
     moments = optimizer.state[parameters.dc]["exp_avg"]
     assert torch.equal(moments[:3, 0], 0.1 * torch.tensor([1.0, 3.0, 4.0]))
     assert not moments[3:].any()
+
+
+def test_a_view_adds_its_gradients_in_half_images_and_counts_what_it_draws():
+    control = DensityControl(SplatConfig(), EXTENT, 3, CPU)
+    camera = Camera(np.eye(4), 50.0, 50.0, 24.0, 18.0, 48, 36)
+    gradient = torch.tensor([[3 / 24, -4 / 18], [0.0, 0.0], [0.5 / 24, 0.0]])
+    for times in (1, 2):
+        control.observe(gradient, torch.tensor([True, False, True]), camera)
+        assert torch.allclose(control.gradient, times * torch.tensor([5.0, 0.0, 0.5]))
+        assert control.seen.tolist() == [times, 0, times]
+
+
+def test_splats_are_judged_by_their_mean_gradient_over_the_views_that_drew_them():
+    parameters = made([0.001] * 4, [0.5] * 4)
+    before = parameters.trained()
+    control = DensityControl(SplatConfig(gradient_threshold=1.0), EXTENT, 4, CPU)
+    control.gradient[:] = torch.tensor([9.0, 1.1, 0.9, 11.0])
+    control.seen[:] = torch.tensor([10.0, 1.0, 0.0, 10.0])
+    optimizer = after_one_step(parameters, SplatConfig())
+    control.act(parameters, optimizer, torch.Generator().manual_seed(0), remove_large=False)
+    assert torch.equal(parameters.dc[4:], before.dc[[1, 3]])
 
 
 def test_parts_are_spread_as_their_parent_is():

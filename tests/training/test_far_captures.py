@@ -110,9 +110,8 @@ def test_the_offset_survives_a_checkpoint_and_the_run_goes_on(blob_scene, tiny_c
     for _ in range(17):
         first.train_step()
     first.save(path)
-    loaded = load_checkpoint(path)
-    assert loaded.model.world_offset == whole.model.world_offset != (0.0, 0.0, 0.0)
-    second = Trainer.resumed(scene, loaded, tiny_config, CPU)
+    assert load_checkpoint(path).model.world_offset == whole.model.world_offset != (0.0, 0.0, 0.0)
+    second = Trainer.resumed(scene, path, tiny_config, CPU)
     second.run(None, None)
     assert torch.equal(whole.model.references, second.model.references)
 

@@ -1,8 +1,9 @@
 """What all commands have in common."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
@@ -60,6 +61,15 @@ class SceneFileArgument:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SceneFileOrRunArgument:
+    """Which file; one that a run has left brings its scene along."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE|RUN")]
+    """A .cgs file, or splats: .ply as 3DGS writes it, .spz, .sog (or its meta.json), .glb, .splat; or the folder of a
+    run, for its file, and its scene read as in training."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReadingOptions:
     """How a scene is read."""
 
@@ -105,6 +115,17 @@ class SceneOptions(ReadingOptions):
     def scene_source(self, *, holdout: bool = True) -> SceneSource:
         """Raises UsageError if not exactly one scene was given."""
         return self.source_at(one_scene(self.scene, self.source), holdout=holdout)
+
+    def source_of_run(self, begun: SceneSource) -> SceneSource:
+        """As a run read its scene; what is given here goes before that. Raises UsageError."""
+        self.check_reading()
+        options = {field.name: field.default for field in dataclasses.fields(ReadingOptions)}
+        given: dict[str, Any] = {
+            name: getattr(self, name) for name in options if getattr(self, name) != options[name]
+        }
+        if self.scene or self.source:
+            given["path"] = str(one_scene(self.scene, self.source))
+        return dataclasses.replace(begun, **given)
 
 
 def one_scene(scene: Path | None, source: Path | None) -> Path:

@@ -1,7 +1,6 @@
 """`compgs decode`: what a file holds, as arrays."""
 
 import io
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +11,7 @@ from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument
 from compgs.cli.console import duration, say, size
 from compgs.cli.inputs import check_bitstream
 from compgs.cli.prefixes import parse_prefix
+from compgs.numerics.compiling import working_seconds
 from compgs.outputs import check_output_folder, write_bytes
 
 
@@ -55,9 +55,9 @@ class Decode(ComputingCommand, FileArgument):
         self.prepare()
         from compgs.codec import decode
 
-        start = time.perf_counter()
+        start = working_seconds()
         model = decode(self.file, self.device, prefix=prefix)
-        seconds = time.perf_counter() - start
+        seconds = working_seconds() - start
         taken = self.file.stat().st_size if prefix is None else min(prefix, self.file.stat().st_size)
         part = "" if prefix is None else "first "
         say(

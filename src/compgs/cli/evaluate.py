@@ -6,21 +6,24 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions, check_lpips
-from compgs.cli.console import print_results, say
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileOrRunArgument, SceneOptions, check_lpips
+from compgs.cli.console import print_results, say, warn
 from compgs.cli.progress import counting
+from compgs.cli.run_folder import file_and_run, read_otherwise
 from compgs.cli.scenes import read_scene
 from compgs.outputs import check_output_folder
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
+class Evaluate(ComputingCommand, SceneOptions, SceneFileOrRunArgument):
     """Decode a file, render a scene's held-out views from it and compare them with the photographs.
 
     Give -r, --images, --test-every and --background as in training: the views held out there are the ones to
-    evaluate on.
+    evaluate on. A run's folder, or the file in it, needs none of that, and no scene.
 
     Examples
+
+    compgs evaluate runs/garden
 
     compgs evaluate garden.cgs scenes/garden
 
@@ -43,10 +46,14 @@ class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
     def run(self) -> None:
         from compgs.formats import check_scene
 
-        check_scene(self.file)
+        file, run = file_and_run(self.file)
+        check_scene(file)
         if self.output is not None:
             check_output_folder(self.output, overwrite=self.overwrite)
-        source = self.scene_source()
+        whole = self.file.is_dir() or not (self.scene or self.source)
+        source = self.source_of_run(run.scene) if run and whole else self.scene_source()
+        if run and (otherwise := read_otherwise(run.scene, source)):
+            warn(f"{file} was trained with {otherwise}")
         self.prepare()
         if self.lpips:
             check_lpips()
@@ -55,7 +62,7 @@ class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
         scene = read_scene(source)
         with counting("evaluating views") as progress:
             results = evaluate(
-                self.file,
+                file,
                 scene,
                 output=self.output,
                 overwrite=self.overwrite,

@@ -13,6 +13,8 @@ from rich.table import Table
 from compgs import __version__
 from compgs.cli.arguments import command_name, parse_command
 from compgs.cli.command import Command
+from compgs.cli.compare import Compare
+from compgs.cli.compiling import say_when_compiling
 from compgs.cli.console import console, errors, show_whatever_can_be_shown
 from compgs.cli.decode import Decode
 from compgs.cli.demo_scene import DemoScene
@@ -20,7 +22,9 @@ from compgs.cli.encode import Encode
 from compgs.cli.evaluate import Evaluate
 from compgs.cli.export import Export
 from compgs.cli.info import Info
+from compgs.cli.reconstruct import Reconstruct
 from compgs.cli.render import Render
+from compgs.cli.report import Report
 from compgs.cli.serve import Serve
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError, in_words_of_options
@@ -29,12 +33,15 @@ from compgs.errors import CompGSError
 from compgs.interrupt import Terminated, ended_on_request, held_back
 
 COMMANDS: tuple[type[Command], ...] = (
+    Reconstruct,
     Train,
     Encode,
     Decode,
     Render,
     Evaluate,
     View,
+    Compare,
+    Report,
     Export,
     Serve,
     Info,
@@ -85,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(command: Command) -> int:
     """The exit code; unexpected exceptions, which are our mistakes, keep their traceback."""
+    say_when_compiling()
     try:
         with ended_on_request():
             command.run()

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileOrRunArgument, SceneOptions
 from compgs.cli.console import duration, say
 from compgs.cli.progress import counting
+from compgs.cli.run_folder import RunSettings, SceneSource, file_and_run
 from compgs.cli.scenes import read_scene
 from compgs.cli.usage import UsageError, check_range
 from compgs.errors import OutputError
@@ -30,7 +31,7 @@ VIDEO_BYTES = 16 << 20  # that must be free for a video; a long one fails later
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(ComputingCommand, SceneOptions, SceneFileArgument):
+class Render(ComputingCommand, SceneOptions, SceneFileOrRunArgument):
     """Render images or a video from a file of splats: views of a scene, cameras of a JSON file, or a way through it.
 
     A camera file is a list of objects with world_to_camera (4 x 4, OpenCV axes), fx, fy, cx, cy, width and
@@ -38,6 +39,8 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
     00000.png, 00001.png, ...; the cameras.json beside them says which is which.
 
     Examples
+
+    compgs render runs/garden -o renders
 
     compgs render garden.cgs scenes/garden -o renders
 
@@ -99,7 +102,8 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
         self.check_values()
         from compgs.formats import check_scene, open_scene
 
-        check_scene(self.file)
+        file, run = file_and_run(self.file)
+        check_scene(file)
         self.check_output()
         if self.cameras is not None and (self.scene or self.source):
             raise UsageError("both a scene and --cameras were given; give one")
@@ -107,10 +111,11 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
         self.prepare()
         import torch
 
-        scene = read_scene(self.scene_source()) if self.scene or self.source else None
+        source = self.views_source(run)
+        scene = read_scene(source) if source else None
         views = self.given_views(scene)
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
-        model = open_scene(self.file, device, scene.background if scene else BLACK)
+        model = open_scene(file, device, scene.background if scene else BLACK)
         if self.background is not None:
             model = model.over(self.background)
         self.render(model, views or self.way(model, keyframes))
@@ -131,6 +136,12 @@ class Render(ComputingCommand, SceneOptions, SceneFileArgument):
             raise UsageError(f"--distance {self.distance}: expected a finite number above 0")
         if not any(self.up) or not all(map(math.isfinite, self.up)):
             raise UsageError(f"--up {' '.join(map(str, self.up))}: expected a direction, not all of it zero")
+
+    def views_source(self, run: RunSettings | None) -> SceneSource | None:
+        """The scene whose views are rendered, if any are: that of a run's folder is read as in training."""
+        if run and self.file.is_dir() and self.cameras is None and self.path is None:
+            return self.source_of_run(run.scene)
+        return self.scene_source() if self.scene or self.source else None
 
     def check_output(self) -> None:
         """Raises OutputError, MissingDependency."""

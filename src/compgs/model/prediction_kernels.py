@@ -13,10 +13,11 @@ primitives were drawn, then side by side. Blocks are fixed: no result depends on
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from compgs.model.constants import OPACITY_CUTOFF, SMALLEST_DISTANCE
 from compgs.model.residual_mlp_kernels import ANCHORS, CHUNKS, ROWS, activations, begin_block, tiled
+from compgs.numerics.compiled import njit
 
 _FASTMATH = {"contract", "nsz", "arcp"}
 _f32 = np.float32
@@ -63,7 +64,7 @@ def _sigmoids(flat, n):
 # all primitives: each kernel fills its last arguments ---------------------------------------------------------------
 
 
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
+@njit(parallel=True, fastmath=_FASTMATH)
 def activate_opacities(
     raw,  # [P, C] of the opacity or the appearance network: opacity comes first
     opacities,  # [P]
@@ -77,7 +78,7 @@ def activate_opacities(
             opacities[i] = opacity_of_sigmoid(opacities[i])
 
 
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
+@njit(parallel=True, fastmath=_FASTMATH)
 def activate_colors(
     raw,  # [P, C] of the color or the appearance network: color comes last
     rows,  # [M] int64: those to activate
@@ -92,7 +93,7 @@ def activate_colors(
         _sigmoids(colors[first:last].ravel(), 3 * (last - first))
 
 
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
+@njit(parallel=True, fastmath=_FASTMATH)
 def affine_transform(
     raw,  # [M, 10] of the geometry network: translation, scaling, quaternion
     anchor,  # [M] int64: anchor of each primitive
@@ -120,7 +121,7 @@ def affine_transform(
                 quaternions[j, c] = raw[j, 6 + c]
 
 
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
+@njit(parallel=True, fastmath=_FASTMATH)
 def activation_gradients(
     opacities,  # [M], and so on: what `activate_...` and `affine_transform` gave
     colors,
@@ -157,7 +158,7 @@ def activation_gradients(
 # what a camera sees ---------------------------------------------------------------------------------
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def see(
     anchors,  # [V] int64: those in view
     positions,  # [N, 3] world units
@@ -171,7 +172,7 @@ def see(
         _see_block(anchors[first:last], positions, references, center, distance_unit, seen[first:last])
 
 
-@njit(fastmath=_FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=_FASTMATH, error_model="numpy")
 def _see_block(anchors, positions, references, center, distance_unit, seen):
     D = references.shape[1]
     for i in range(len(anchors)):
@@ -185,7 +186,7 @@ def _see_block(anchors, positions, references, center, distance_unit, seen):
         seen[i, D + 3] = distance / distance_unit
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def gather_geometry(
     index,  # [M] int64: those wanted
     means,  # [P, 3], and so on: of all
@@ -209,7 +210,7 @@ def block_count(anchors: int) -> int:
     return -(-anchors // ANCHORS)
 
 
-@njit(parallel=True, fastmath=_FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=_FASTMATH, error_model="numpy")
 def paired_appearance(
     anchors,  # [V] int64, ascending: those in view
     first_coupled,  # [N + 1] int64: first coupled primitive of each anchor
@@ -278,7 +279,7 @@ def paired_appearance(
             drawn[block] = count
 
 
-@njit(fastmath=_FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=_FASTMATH, error_model="numpy")
 def _activate(out, first, H):
     """Adds the skip to out [n, 4] and activates it in place; returns how many primitives are drawn."""
     n = len(out)
@@ -296,7 +297,7 @@ def _activate(out, first, H):
     return count
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def gather_drawn(
     anchors, first_coupled, places, appearance, offsets,
     means, scales, quaternions,

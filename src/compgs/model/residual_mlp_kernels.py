@@ -17,9 +17,10 @@ depends on neither the number of threads nor their timing.
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from compgs.model.constants import NEGATIVE_SLOPE
+from compgs.numerics.compiled import njit
 
 ANCHORS = 128  # in a block
 ROWS = 128  # primitives in a group: all activations of a group fit into the second-level cache
@@ -29,21 +30,21 @@ _SLOPE = np.float32(NEGATIVE_SLOPE)
 _FASTMATH = {"contract", "nsz", "arcp"}
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def _leaky_gradient(d, x, n):
     """d[:n] *= the slope where the activation x was negative; leaky keeps the sign, so its output tells."""
     for i in range(n):
         d[i] = d[i] if x[i] > np.float32(0) else _SLOPE * d[i]
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def _add(x, y, n):
     """x[:n] += y[:n], flat."""
     for i in range(n):
         x[i] += y[i]
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def _add_leaky(x, bias, n):
     """x[:n] = leaky(x + bias), flat."""
     for i in range(n):
@@ -51,14 +52,14 @@ def _add_leaky(x, bias, n):
         x[i] = max(y, _SLOPE * y)
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def _add_two(x, y, bias, n):
     """x[:n] = (x + bias) + y, flat."""
     for i in range(n):
         x[i] = x[i] + bias[i] + y[i]
 
 
-@njit(cache=True)
+@njit
 def tiled(biases):
     """[blocks, H] -> [blocks, ROWS * H]: a bias for each number of a group, so that adding it is one flat loop."""
     H = biases.shape[1]
@@ -69,7 +70,7 @@ def tiled(biases):
     return tiles
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def _add_shared(first, shared, index, x):
     """first[i] += shared[index[i]]; x [n, H] = leaky(its first columns)."""
     H, F = x.shape[1], first.shape[1]
@@ -82,7 +83,7 @@ def _add_shared(first, shared, index, x):
             first[i, j] += shared[anchor, j]
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def activations(residuals, index, shared, residual_entry, weights1, tiles1, weights2, tiles2, first, x, h):
     """One group: fills the last O columns of first [n, H + O], x [blocks + 1, ROWS, H] and h [blocks, ROWS, H]."""
     n, H = residuals.shape[0], weights1.shape[2]
@@ -95,7 +96,7 @@ def activations(residuals, index, shared, residual_entry, weights1, tiles1, weig
         _add_two(x[b + 1].ravel(), x[b].ravel(), tiles2[b], n * H)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def begin(
     features,  # [A, F] float32, of anchors
     anchor_entry,  # [F, H + O]
@@ -108,7 +109,7 @@ def begin(
         begin_block(features[first:last], anchor_entry, entry_bias, shared[first:last])
 
 
-@njit(cache=True)
+@njit
 def begin_block(features, anchor_entry, entry_bias, shared):
     """`begin` of one block of anchors."""
     np.dot(features, anchor_entry, shared)
@@ -128,7 +129,7 @@ def _chosen(residuals, rows, p, q, scratch):
     return scratch[: q - p]
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def forward(
     residuals,  # [P, G] float32
     rows,  # [M] int64, ascending: those that are computed; [0]: all, M = P
@@ -166,7 +167,7 @@ def forward(
                     out[p + i, j] += first[i, H + j]
 
 
-@njit(cache=True)
+@njit
 def chunk_bounds(index, chunks):
     """[chunks + 1] rows of equal parts, moved forward to where the next anchor begins."""
     M = len(index)
@@ -179,7 +180,7 @@ def chunk_bounds(index, chunks):
     return bounds
 
 
-@njit(fastmath=_FASTMATH, cache=True)
+@njit(fastmath=_FASTMATH)
 def _first_gradient(first, dx, x, d, index, d_shared):
     """first [n, H + O] becomes its own gradient: from dx, of x = leaky(first[:, :H]), and d, of first[:, H:]. Each row
     is added to its anchor's in d_shared.
@@ -196,7 +197,7 @@ def _first_gradient(first, dx, x, d, index, d_shared):
                 d_shared[anchor, j] += first[i, j]
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def backward(
     residuals,
     rows,

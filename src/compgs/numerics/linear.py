@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
+
+from compgs.numerics.compiled import njit
 
 PARTS = 16
 # Multiplications of a group: OpenBLAS gives a product that small to one thread.
@@ -64,7 +66,7 @@ def transposed_product(x: Tensor, y: Tensor) -> Tensor:
     return torch.from_numpy(parts.sum(0))
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def _sum_products(x, y, parts):
     n, size = len(x), x.shape[1] * y.shape[1]
     rows = max(1, GROUP_WORK // max(1, size))

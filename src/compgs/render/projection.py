@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from compgs.cameras import Camera
+from compgs.numerics.compiled import njit
 from compgs.render.settings import RasterSettings, jacobian_limits
 
 # No "nnan", "ninf": comparisons with NaN decide what is drawn.
@@ -80,7 +81,7 @@ def load_block(s, first, count, means, quaternions, scales):
         s[i + SZ] = scales[j, 2]
 
 
-@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def project_forward(means, quaternions, scales, k, means2d, covariances, depths, determinants):
     """Fills means2d [M, 2], covariances [M, 3], depths [M], determinants [M]; a depth of inf: not drawn."""
     m = means.shape[0]
@@ -145,7 +146,7 @@ def project_forward(means, quaternions, scales, k, means2d, covariances, depths,
             determinants[j] = s[i + OUT_DET]
 
 
-@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def project_backward(
     means,
     quaternions,

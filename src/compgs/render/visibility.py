@@ -16,10 +16,11 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from compgs.cameras import Camera
+from compgs.numerics.compiled import njit
 from compgs.render.settings import RasterSettings, jacobian_limits
 
 BLOCK = 4096  # anchors
@@ -76,7 +77,7 @@ def frustum(camera: Camera, settings: RasterSettings) -> np.ndarray:
     return world
 
 
-@njit(parallel=True, fastmath={"contract", "nsz"}, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath={"contract", "nsz"}, error_model="numpy")
 def meet_frustum(positions, radii, planes, mask):
     n = positions.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):

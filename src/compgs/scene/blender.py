@@ -24,7 +24,7 @@ def read_blender(folder: Path) -> Capture:
     nothing = Points(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
     names = frozenset(posed.name for posed in test) if test else None
     # white: what the scenes' published figures stand on
-    return Capture(train + test, names, nothing, str(folder), (1.0, 1.0, 1.0))
+    return Capture(train + test, names, nothing, str(folder), (1.0, 1.0, 1.0), cut_out=False)
 
 
 def _read_split(folder: Path, file: Path) -> tuple[PosedImage, ...]:

@@ -4,6 +4,7 @@ Tensors by name; settings, counters and the view order as JSON in the file's met
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import safetensors
 import safetensors.torch
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
@@ -147,9 +148,11 @@ def check_same_run(saved: Config, config: Config, saved_views: list[str], scene:
         raise CheckpointError("the run to continue was trained on other views; give the same scene")
 
 
-def optimizer_tensors(model: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+def optimizer_tensors(
+    parameters: Mapping[str, Tensor], optimizer: torch.optim.Optimizer
+) -> dict[str, Tensor]:
     """Adam's moments by the names of their parameters."""
-    names: dict[Tensor, str] = {p: name for name, p in model.named_parameters()}
+    names = {parameter: name for name, parameter in parameters.items()}
     result = {}
     for parameter, state in optimizer.state.items():
         for key, value in state.items():
@@ -157,9 +160,10 @@ def optimizer_tensors(model: nn.Module, optimizer: torch.optim.Optimizer) -> dic
     return result
 
 
-def restore_optimizer(model: nn.Module, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
+def restore_optimizer(
+    parameters: Mapping[str, Tensor], optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]
+) -> None:
     """Inverse of `optimizer_tensors`."""
-    parameters = dict(model.named_parameters())
     for name, value in tensors.items():
         parameter, key = name.rsplit("/", 1)
         state = optimizer.state.setdefault(parameters[parameter], {})
