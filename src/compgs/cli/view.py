@@ -3,26 +3,20 @@
 import contextlib
 import threading
 import webbrowser
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileOrRunArgument
 from compgs.cli.console import say
-from compgs.cli.usage import UsageError, check_range
-
-if TYPE_CHECKING:
-    from compgs.viewer.live import LiveViewer
-    from compgs.viewer.shown import Shown
-    from compgs.viewer.stage import Stage
-
-MAX_PORT = 65535
+from compgs.cli.run_folder import file_and_run
+from compgs.cli.usage import UsageError
+from compgs.cli.viewing import check_viewing, listening
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(ComputingCommand, SceneFileArgument):
+class View(ComputingCommand, SceneFileOrRunArgument):
     """Show a file of splats in the browser: walk around in it, look behind it, record a flight.
 
     This process renders what each visitor sees, exactly: small pictures while the camera moves, one at the window's
@@ -59,10 +53,9 @@ class View(ComputingCommand, SceneFileArgument):
     def run(self) -> None:
         self.check_values()
         from compgs.formats import check_scene
-        from compgs.viewer.live import check_viewer
 
-        check_viewer()
-        check_scene(self.file)
+        file, _ = file_and_run(self.file)
+        check_scene(file)
         self.prepare()
         import torch
 
@@ -70,9 +63,9 @@ class View(ComputingCommand, SceneFileArgument):
         from compgs.viewer.stage import OwnThread
 
         device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
-        shown = FileShown(self.file, device, self.background)
+        shown = FileShown(file, device, self.background)
         with listening(shown, OwnThread(self.prepare), self.host, self.port) as viewer:
-            say(f"{self.file}: {viewer.address}")
+            say(f"{file}: {viewer.address}")
             if self.open:
                 webbrowser.open(viewer.address)
             with contextlib.suppress(KeyboardInterrupt):
@@ -80,28 +73,7 @@ class View(ComputingCommand, SceneFileArgument):
         say("ended")
 
     def check_values(self) -> None:
-        """Raises UsageError."""
-        check_range("--port", self.port, 0, MAX_PORT)
+        """Raises UsageError, MissingDependency."""
+        check_viewing(self.port)
         if self.background is not None and not all(0 <= part <= 1 for part in self.background):
             raise UsageError(f"--background {self.background}: expected three numbers from 0 to 1")
-
-
-@contextlib.contextmanager
-def listening(
-    shown: "Shown", stage: "Stage", host: str, port: int, *, training: bool = False, options: str = ""
-) -> "Iterator[LiveViewer]":
-    """A viewer, closed at the end. `options`: what stands before `host` and `port` in those of the command. Raises
-    UsageError."""
-    from compgs.viewer.live import LiveViewer
-
-    try:
-        viewer = LiveViewer(shown, stage, host=host, port=port, training=training)
-    except OSError as error:
-        raise UsageError(
-            f"--{options}host {host} --{options}port {port}: cannot be listened at ({error.strerror or error}); "
-            f"give another one; --{options}port 0 takes a free port"
-        ) from error
-    try:
-        yield viewer
-    finally:
-        viewer.close()

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from compgs.errors import ConfigError, MissingDependency, install_line
+from compgs.errors import ConfigError
+from compgs.viewer import check_viewer
 from compgs.viewer.shown import Shown, focus
 from compgs.viewer.stage import Stage
 from compgs.viewer.visitor import Lens, Look, Page, Picture, Visitor, lens_of
@@ -29,14 +30,6 @@ MOVING_QUALITY, FULL_QUALITY = 75, 95  # of the JPEG that a page gets
 TELL_SECONDS = 0.25  # between two lines about the picture
 # Seconds of a picture at rest while the scene is being trained: at full size it would come too late to be of use.
 TRAINING_SECONDS = 0.3
-
-
-def check_viewer() -> None:
-    """Raises MissingDependency, with the remedy, where nothing can be shown."""
-    try:
-        import viser  # noqa: F401
-    except ImportError as error:
-        raise MissingDependency(f"the viewer needs viser: {install_line('view')}") from error
 
 
 def free_port(host: str, port: int) -> int:

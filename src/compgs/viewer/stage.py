@@ -76,6 +76,9 @@ class SpareTime:
                 future.set_result(job())
             except Exception as error:
                 future.set_exception(error)
+            except BaseException:  # the training is stopped
+                future.cancel()
+                raise
             before, now = now, self._clock()
             # The first one loads or compiles kernels, once.
             self._credit -= min(now - before, MOST_CREDIT) if self._first else now - before
