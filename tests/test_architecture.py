@@ -61,7 +61,7 @@ ALLOWED = {
     | {"training", "trained_model", "stored_weights"},
     "reconstruct": BASE | {"scene"},
     "evaluation": BASE | {"scene", "render", "model", "devices", "metrics", "codec", "formats"},
-    "viewer": BASE,
+    "viewer": BASE | {"render", "model", "devices", "metrics", "codec", "formats", "evaluation"},
     "exporting": BASE | {"render", "model", "devices", "metrics", "formats", "evaluation", "viewer"},
     "cli": BASE
     | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "training", "evaluation"}

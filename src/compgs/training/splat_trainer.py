@@ -39,6 +39,7 @@ from compgs.training.loop import (
     Run,
     StepResult,
     TrainingStatus,
+    Watch,
     chosen_config,
     rasterize_step,
     run_to_end,
@@ -248,10 +249,15 @@ class SplatTrainer:
 
     # the run -------------------------------------------------------------------------------------------------------
 
-    def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
+    def run(
+        self,
+        path: Path | None,
+        on_progress: Callable[[TrainingStatus], None] | None,
+        watch: Watch | None = None,
+    ) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         check_points_seen(self.scene, self.settings.near_plane)
-        run_to_end(self, self.config.training, path, on_progress)
+        run_to_end(self, self.config.training, path, on_progress, watch)
 
     def estimated_bytes(self) -> int:
         """Size of the method's file if it were written now; of a .ply file without its header."""
@@ -263,6 +269,10 @@ class SplatTrainer:
     def finish(self) -> None:
         """Plain 3DGS has nothing left to do: the file holds the splats as they are."""
         self.hooks.finish(self)
+
+    def snapshot(self) -> SplatModel:
+        """Before any `transform`, for which a hook may draw random numbers."""
+        return self.model()
 
     def model(self) -> SplatModel:
         """The splats of now, before any `transform`."""
