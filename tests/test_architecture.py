@@ -57,9 +57,10 @@ ALLOWED = {
     "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
     "viewer": BASE,
     "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},
+    "suites": BASE | {"evaluation", "methods"},
     "cli": BASE
     | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "viewer", "methods", "reconstruct"},
+    | {"trained_model", "exporting", "viewer", "methods", "reconstruct", "suites"},
     "__main__": BASE | {"cli"},
 }
 
