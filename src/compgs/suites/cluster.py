@@ -5,6 +5,7 @@ cluster: `run_job`, which continues a run that was stopped. So a worker that is 
 checkpoint of one run, and nothing else.
 """
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -50,7 +51,7 @@ def run_on_cluster(
                 address=None if address == LOCAL else address,
                 include_dashboard=False if address == LOCAL else None,
                 log_to_driver=False,
-                logging_level="warning",
+                logging_level=logging.WARNING,
             )
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise ConfigError(f"--cluster {address}: cannot be reached ({error}); is it running?") from error
