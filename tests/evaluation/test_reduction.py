@@ -1,6 +1,7 @@
 """Smaller files of a made-up model: which primitives go, what is reported, what is refused."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -94,6 +95,13 @@ def test_the_least_important_share_goes(data: bytes, cameras: list[Camera], drop
     result, reduction = reduce_file(data, drop=drop, cameras=cameras)
     assert reduction.after.coupled_primitives == kept.sum() == decoded(result).coupled
     assert reduction.after.bytes == len(result) < reduction.before.bytes == len(data)
+
+
+def test_of_primitives_that_contribute_alike_the_later_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = torch.tensor([1.0, 0.0, 0.0, 2.0, 0.0, 3.0])
+    monkeypatch.setattr("compgs.evaluation.reduction.importance", lambda *_: found)
+    model = SimpleNamespace(coupled=6)
+    assert most_important(model, [], 0.34).tolist() == [True, True, False, True, False, True]
 
 
 def test_dropping_what_contributes_least_loses_less_than_dropping_any(

@@ -77,6 +77,21 @@ def test_transparent_anchors_are_removed_with_their_moments(blob_scene, tiny_con
     trainer.train_step()
 
 
+def test_new_anchors_have_no_momentum_and_the_others_keep_theirs(blob_scene, tiny_config):
+    trainer = ready(blob_scene, tiny_config)
+    control, model = trainer.control, trainer.model
+    n = model.anchors
+    before = trainer.optimizer.state[model.references]["exp_avg"].clone()
+    control.drawn[:] = 1000
+    control.gradient[:] = 1e6
+    control.act(model, trainer.optimizer, trainer.coupled_means() * 1.7, torch.Generator(), 0.004)
+    assert model.anchors > n
+    for name in model.anchor_parameters:
+        state = trainer.optimizer.state[getattr(model, name)]
+        assert not state["exp_avg"][n:].any() and not state["exp_avg_sq"][n:].any()
+    assert torch.equal(trainer.optimizer.state[model.references]["exp_avg"][:n], before)
+
+
 def test_a_scene_whose_anchors_are_all_transparent_keeps_them(blob_scene, tiny_config):
     trainer = ready(blob_scene, tiny_config)
     before = trainer.model.anchors
