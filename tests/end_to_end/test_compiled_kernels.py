@@ -29,7 +29,9 @@ print(sum(blend_backward.stats.cache_hits.values()))
 """
 
 
-def test_freshly_compiled_and_cached_kernels_train_the_same_models(scene_folder: Path, tmp_path: Path) -> None:
+def test_freshly_compiled_and_cached_kernels_train_the_same_models(
+    scene_folder: Path, tmp_path: Path
+) -> None:
     """numba optimizes a parallel kernel once to run it and once more for its cache."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
     hits = []

@@ -134,11 +134,13 @@ def test_scales_start_anew_at_the_spread_around_what_the_hyperprior_expects(entr
     with torch.no_grad():
         for layer in (entropy.reference_analysis.first, entropy.reference_analysis.second):
             layer.weight.mul_(2.0)
+        entropy.reference_network.weights[-1][3] = 0
     weight, bias = entropy.restart_reference_scales(references)
     with torch.no_grad():
         mean, scale = entropy.reference_network(entropy.reference_analysis(references).round())
     spread = (references - mean).double().std(0, correction=0)
     plain = references.double().std(0, correction=0)
+    assert spread[3] < 1e-3
     assert ((spread - plain).abs() > 0.02 * plain.clamp_min(0.1)).any()
     torch.testing.assert_close(
         scale_from_index(scale).double(), spread.clamp_min(0.2).expand(400, -1), rtol=1e-3, atol=0
