@@ -1,6 +1,7 @@
 """Smaller files of a made-up model: which primitives go, what is reported, what is refused."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -83,6 +84,14 @@ def test_importance_sums_over_cameras_and_shares_the_pixels(data: bytes, cameras
     assert float(together.sum()) == pytest.approx(covered, rel=1e-3)
     apart = sum(importance(model, [camera]) for camera in cameras)
     assert torch.allclose(together, apart)
+
+
+def test_importance_is_the_same_wherever_the_scene_lies(data: bytes, cameras: list[Camera]) -> None:
+    """Cameras are the world's."""
+    model = decoded(data)
+    far = replace(model, world_offset=(1e5, -2e4, 0.0))
+    moved = [camera.moved((-1e5, 2e4, 0.0)) for camera in cameras]
+    torch.testing.assert_close(importance(far, moved), importance(model, cameras), rtol=1e-3, atol=1e-2)
 
 
 @pytest.mark.parametrize("drop", [0.05, 0.5, 0.99])
