@@ -131,8 +131,9 @@ def test_the_circle_is_around_three_quarters_of_the_positions() -> None:
     directions = chance.normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     near, far = directions[:40], 60 * directions[40:]
-    positions = np.concatenate([near, -near, far, -far]) + (1.0, 2.0, 3.0)
+    middle = np.array([1.0, 2.0, 3.0])
+    positions = middle + np.concatenate([near, -near, far, -far])
     for _, camera in orbit(positions, frames=4, width=64, height=48, elevation=30.0, distance=2.0):
-        away = camera.center - (1.0, 2.0, 3.0)
+        away = camera.center - middle
         assert np.linalg.norm(away) == pytest.approx(2.0, rel=0.05)
         assert -away[1] == pytest.approx(1.0, rel=0.1)  # up is -y
