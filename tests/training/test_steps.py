@@ -32,7 +32,7 @@ def started(scene: Scene, config: Config, step: int = 0, view: int = 2) -> Train
         for latents in (trainer.model.references, trainer.model.residuals):
             latents += torch.randn(latents.shape, generator=chance)
     trainer.step = step
-    trainer.order = [view]
+    trainer.views.order = [view]
     return trainer
 
 
@@ -156,7 +156,7 @@ def test_sparse_adam_leaves_anchors_out_of_view_alone_and_dense_adam_moves_them_
     narrow = replace(other, camera=replace(other.camera, fx=400.0, fy=400.0))
     scene = replace(blob_scene, train_views=(whole, narrow))
     trainer = started(scene, with_training(tiny_config, **CERTAIN, sparse_adam=sparse))
-    trainer.order = [1, 0]
+    trainer.views.order = [1, 0]
     model = trainer.model
     with torch.no_grad():
         model.log_scales -= 2.0  # so that they reach less far

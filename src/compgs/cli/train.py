@@ -31,6 +31,7 @@ from compgs.cli.sizes import parse_cameras, parse_size
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.cli.viewing import check_viewing, viewing
 from compgs.errors import MissingSparseModel
+from compgs.extras import require
 from compgs.methods import METHODS, Method, settings_of, train
 from compgs.outputs import check_output_folder, write_json
 
@@ -152,10 +153,11 @@ class Train(ComputingCommand, SceneOptions):
             )
         if self.resume and self.overwrite:
             raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
+        require("train", "training")
         folder = self.output
         check_output_folder(folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES)
         settings = self.settings(folder)
-        self.prepare()
+        self.prepare_training()
         if self.lpips:
             check_lpips()
         if self.viewer:
@@ -173,7 +175,7 @@ class Train(ComputingCommand, SceneOptions):
         start = time.perf_counter()
         written = method.write(model, path, settings.config)
         say(f"{path}: {size(written)}, written in {duration(time.perf_counter() - start)}")
-        self.evaluate(scene, path, folder, settings.method)
+        self.evaluate(scene, path, folder, settings)
         if settings.config.training.target_bytes is not None:
             say_miss(folder, settings.config.training.target_bytes)
 
@@ -333,7 +335,7 @@ class Train(ComputingCommand, SceneOptions):
             print_profile(profile.milliseconds())
         return model
 
-    def evaluate(self, scene: "Scene", file: Path, folder: Path, method: str) -> None:
+    def evaluate(self, scene: "Scene", file: Path, folder: Path, settings: RunSettings) -> None:
         if not scene.test_views:
             say("no views are held out (--no-eval): the file was not evaluated")
             return
@@ -348,7 +350,8 @@ class Train(ComputingCommand, SceneOptions):
                 lpips=self.lpips,
                 device=self.device,
                 progress=progress,
-                method=method,
+                method=settings.method,
+                exposure=settings.config.training.exposure,
             )
         say("")
         print_results(results)

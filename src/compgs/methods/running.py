@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from compgs.config import PRESETS, Config, check_config, config_from_dict, load_config
 from compgs.errors import ConfigError
+from compgs.extras import require
 from compgs.methods.method import Method
 
 if TYPE_CHECKING:
-    import torch
-
+    from compgs.devices import Device
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
     from compgs.training.loop import TrainingStatus, Watch
@@ -48,7 +48,7 @@ def train(
     output: str | Path | None = None,
     resume: bool = False,
     on_progress: "Callable[[TrainingStatus], None] | None" = None,
-    device: "str | torch.device | None" = None,
+    device: "Device | None" = None,
     profile: "StepProfile | None" = None,
     watch: "Watch | None" = None,
 ) -> Any:
@@ -62,9 +62,10 @@ def train(
     where the time goes. `watch(trainer)` is called between any two steps: `trainer.snapshot()` can be rendered. Default
     device: CUDA where there is one.
 
-    Raises ConfigError, CheckpointError, OutputError, SplatFileError, and TrainingError when the optimization cannot go
-    on.
+    Raises ConfigError (without torch MissingDependency), CheckpointError, OutputError, SplatFileError, and
+    TrainingError when the optimization cannot go on.
     """
+    require("train", "training")
     from compgs.scene import as_scene
     from compgs.training.loop import Run
 

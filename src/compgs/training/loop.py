@@ -15,8 +15,9 @@ from compgs.config import Config, TrainingConfig, check_config, load_config
 from compgs.errors import ConfigError, TrainingError
 from compgs.gaussians import Gaussians
 from compgs.interrupt import held_back
-from compgs.losses import Target
-from compgs.render import RasterResult, RasterSettings, Renderable, rasterize
+from compgs.losses import Target, exposed
+from compgs.render import RasterResult, RasterSettings, Renderable
+from compgs.tensors.rasterize import rasterize
 from compgs.training.allocation import freed_memory_kept
 from compgs.training.checkpoint import CHECKPOINT_NAME
 from compgs.training.profile import StepProfile
@@ -248,7 +249,8 @@ def run_to_end(
 
 def _status(trainer: Trains, steps: int, result: StepResult, estimate: int, pace: float) -> TrainingStatus:
     photograph, counted = result.photograph.image.to(result.image.dtype) / 255.0, result.photograph.counted
-    squares = (result.image.clamp(0, 1) - photograph) ** 2
+    image = exposed(result.image, result.photograph.exposure).detach()
+    squares = (image.clamp(0, 1) - photograph) ** 2
     error = float((squares if counted is None else squares[counted]).mean())
     psnr = -10.0 * float(np.log10(max(error, 1e-10)))
     return TrainingStatus(
