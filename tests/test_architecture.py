@@ -61,11 +61,12 @@ ALLOWED = {
     | {"training", "trained_model", "stored_weights"},
     "reconstruct": BASE | {"scene"},
     "evaluation": BASE | {"scene", "render", "model", "devices", "metrics", "codec", "formats"},
-    "viewer": BASE,
+    "viewer": BASE | {"render", "model", "devices", "metrics", "codec", "formats", "evaluation"},
     "exporting": BASE | {"render", "model", "devices", "metrics", "formats", "evaluation", "viewer"},
+    "suites": BASE | {"evaluation", "methods", "metrics"},
     "cli": BASE
     | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "viewer", "methods", "reconstruct"},
+    | {"trained_model", "exporting", "viewer", "methods", "reconstruct", "suites"},
     "__main__": BASE | {"cli"},
 }
 

@@ -33,6 +33,13 @@ def test_identical_images_have_infinite_psnr_and_an_ssim_of_one():
     assert metrics.ssim(PHOTOGRAPH, PHOTOGRAPH.copy()) == pytest.approx(1.0, abs=1e-6)
 
 
+def test_of_pictures_that_may_be_equal_the_mean_is_finite_unless_all_are():
+    assert metrics.mean_psnr([30.0, 40.0]) == 35.0
+    assert metrics.mean_psnr([math.inf, 40.0]) == 70.0
+    assert metrics.mean_psnr([120.0, 40.0]) == 70.0
+    assert metrics.mean_psnr([math.inf, math.inf]) == math.inf
+
+
 @pytest.mark.parametrize("metric", [metrics.psnr, metrics.ssim])
 def test_metrics_are_symmetric_and_fall_with_the_disturbance(metric):
     values = [metric(PHOTOGRAPH, disturbed(amount)) for amount in (2, 20, 100)]

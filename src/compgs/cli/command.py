@@ -1,6 +1,7 @@
 """What all commands have in common."""
 
 import dataclasses
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -52,6 +53,20 @@ class ComputingCommand(Command):
             import torch
 
             torch.set_num_threads(self.threads)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecodingCommand(ComputingCommand):
+    """A command that decodes a file."""
+
+    tmc3: FlagCreatePairsOff[bool] = False
+    """Let the program tmc3 from PATH decode anchor positions that a file has by G-PCC."""
+
+    def prepare(self) -> None:
+        """Apply `threads` and `tmc3`, check `device`. Raises UsageError, ConfigError."""
+        super().prepare()
+        if self.tmc3:
+            allow_tmc3()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,6 +170,13 @@ def use_threads(count: int) -> None:
     limit = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     check_range("--threads", count, 1, limit)
     numba.set_num_threads(count)
+
+
+def allow_tmc3() -> None:
+    """From now on, in this process."""
+    from compgs.codec.tmc3 import ASKED_BY
+
+    os.environ[ASKED_BY] = "1"
 
 
 def check_lpips() -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument
+from compgs.cli.command import NO_DEFAULT, DecodingCommand, FileArgument
 from compgs.cli.console import duration, say, size
 from compgs.cli.inputs import check_bitstream
 from compgs.cli.prefixes import parse_prefix
@@ -16,7 +16,7 @@ from compgs.outputs import check_output_folder, write_bytes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Decode(ComputingCommand, FileArgument):
+class Decode(DecodingCommand, FileArgument):
     """Decode a .cgs file and write what it holds as NumPy arrays.
 
     latents.npz: positions [N, 3], log_scales [N, 6] and references [N, C] of the anchors; residuals [P, C]

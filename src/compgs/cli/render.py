@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileOrRunArgument, SceneOptions
+from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileOrRunArgument, SceneOptions
 from compgs.cli.console import duration, say
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import RunSettings, SceneSource, file_and_run
@@ -31,7 +31,7 @@ VIDEO_BYTES = 16 << 20  # that must be free for a video; a long one fails later
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(ComputingCommand, SceneOptions, SceneFileOrRunArgument):
+class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
     """Render images or a video from a file of splats: views of a scene, cameras of a JSON file, or a way through it.
 
     A camera file is a list of objects with world_to_camera (4 x 4, OpenCV axes), fx, fy, cx, cy, width and

@@ -17,7 +17,7 @@ from compgs.codec.writer import Geometry, write_content
 from compgs.devices import placed
 from compgs.errors import ConfigError
 from compgs.evaluation.importance import importance
-from compgs.evaluation.measure import counted_pixels
+from compgs.evaluation.measure import compared
 from compgs.model.hybrid_model import HybridModel
 from compgs.render import render
 from compgs.scene.views import View
@@ -140,6 +140,6 @@ def _image(model: HybridModel, camera: Camera) -> np.ndarray:
 
 
 def _side(data: bytes, model: HybridModel, held_out: Sequence[View]) -> Side:
-    psnrs = [metrics.psnr(_image(model, view.camera), view.image, counted_pixels(view)) for view in held_out]
+    psnrs = [metrics.psnr(*compared(_image(model, view.camera), view)) for view in held_out]
     psnr = fmean(psnrs) if psnrs else None
     return Side(len(data), model.anchors, model.coupled, psnr)

@@ -21,6 +21,7 @@ SPLAT_SETTINGS = (
     "training.steps",
     "training.seed",
     "training.ssim_weight",
+    "training.exposure",
     "training.checkpoint_minutes",
 )
 Presets = Mapping[str, Mapping[str, Mapping[str, Any]]]
