@@ -14,8 +14,8 @@ from compgs.codec.writer import write_content
 from compgs.config import Config, ModelConfig
 from compgs.evaluation.camera_path import orbit
 from compgs.gaussians import Gaussians
-from compgs.render import rasterize
 from compgs.scene.views import Points, Scene, View
+from compgs.tensors.rasterize import rasterize
 from compgs.trained_model import TrainedModel
 
 

@@ -8,7 +8,7 @@ from torch import nn
 
 from compgs import metrics
 from compgs.errors import CompGSError
-from compgs.numerics.ssim import ssim
+from compgs.tensors.ssim import ssim
 
 RNG = np.random.default_rng(0)
 PHOTOGRAPH = RNG.integers(0, 256, (40, 50, 3), dtype=np.uint8)
@@ -57,7 +57,7 @@ def test_ssim_agrees_with_float64():
 
 
 def test_renderings_are_rounded_and_clamped_not_truncated():
-    image = torch.tensor([[[0.9 / 255, 0.4 / 255, 254.6 / 255], [-0.3, 1.7, 1.0]]])
+    image = np.array([[[0.9 / 255, 0.4 / 255, 254.6 / 255], [-0.3, 1.7, 1.0]]], np.float32)
     assert metrics.to_8bit(image).tolist() == [[[1, 0, 255], [0, 255, 255]]]
 
 
