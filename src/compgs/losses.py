@@ -25,7 +25,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.numerics.ssim import l1_and_ssim, ssim
+from compgs.numerics.ssim import l1_and_ssim
+from compgs.tensors.ssim import ssim
 
 COMMON_EXTENT = 5.0  # world units
 REVIVED = 0.05  # opacity, well above the rasterizer's cutoff

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from compgs import metrics
@@ -55,7 +54,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     module = "compgs.evaluation.measure"
 
     def render(model: StandIn, camera: Camera) -> SimpleNamespace:
-        return SimpleNamespace(image=torch.full((camera.height, camera.width, 3), model.level))
+        return SimpleNamespace(image=np.full((camera.height, camera.width, 3), model.level, np.float32))
 
     monkeypatch.setattr(f"{module}.open_scene", lambda path, device, background: StandIn(100 / 255))
     monkeypatch.setattr(f"{module}.component_bytes", lambda path: {"positions": 300, "weights": 700})

@@ -67,12 +67,11 @@ class Decode(DecodingCommand, FileArgument):
         if self.output is None:
             return
         import numpy as np
-        import torch
 
-        offset = torch.tensor(model.world_offset, dtype=torch.float64)
+        offset = np.array(model.world_offset, dtype=np.float64)
         p = model.primitives
         means, scales, quaternions = model.geometry
-        contents = {
+        contents: dict[str, dict[str, Any]] = {
             "latents.npz": {
                 "positions": p.positions,
                 "log_scales": p.log_scales,
@@ -88,9 +87,8 @@ class Decode(DecodingCommand, FileArgument):
                 "world_offset": offset,
             },
         }
-        for name, tensors in contents.items():
+        for name, arrays in contents.items():
             buffer = io.BytesIO()
-            arrays: dict[str, Any] = {key: value.cpu().numpy() for key, value in tensors.items()}
             np.savez(buffer, **arrays)
             write_bytes(self.output / name, buffer.getvalue())
             say(f"{self.output / name}: {size(buffer.tell())}")

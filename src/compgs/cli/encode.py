@@ -76,7 +76,10 @@ class Encode(DecodingCommand, ReadingOptions):
 
     def run(self) -> None:
         path = self.check()
-        self.prepare()
+        if self.source.is_dir():
+            self.prepare_training()
+        else:
+            self.prepare()
         start = time.perf_counter()
         data = self.encoded_run() if self.source.is_dir() else read_bitstream(self.source)
         if self.reduces:

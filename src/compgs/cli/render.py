@@ -109,13 +109,12 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
             raise UsageError("both a scene and --cameras were given; give one")
         keyframes = self.keyframes()
         self.prepare()
-        import torch
+        from compgs.devices import chosen_device
 
         source = self.views_source(run)
         scene = read_scene(source) if source else None
         views = self.given_views(scene)
-        device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
-        model = open_scene(file, device, scene.background if scene else BLACK)
+        model = open_scene(file, chosen_device(self.device), scene.background if scene else BLACK)
         if self.background is not None:
             model = model.over(self.background)
         self.render(model, views or self.way(model, keyframes))
@@ -206,7 +205,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
         from compgs.evaluation.camera_path import orbit
 
         circle = orbit(
-            model.bounds[0].cpu().numpy(),
+            model.bounds[0],
             frames=self.frames,
             width=self.width,
             height=self.height,

@@ -132,7 +132,9 @@ def decode_positions_tmc3(data: bytes, count: int) -> NDArray[np.int32]:
 def find_program() -> str:
     """Path of `tmc3`. Raises MissingDependency."""
     program = shutil.which(PROGRAM)
-    if program is None:
+    # Windows looks into the current folder first, whatever PATH says, and what lies there may have come with a scene.
+    folders = [os.path.abspath(folder) for folder in os.environ.get("PATH", "").split(os.pathsep) if folder]
+    if program is None or os.path.dirname(os.path.abspath(program)) not in folders:
         raise MissingDependency(
             f"geometry by G-PCC: no program {PROGRAM!r} on PATH; build github.com/MPEGGroup/mpeg-pcc-tmc13 "
             "and put it there, or use the octree coder, which is the default"

@@ -4,14 +4,15 @@ import hashlib
 import io
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
-import torch
 from PIL import Image
 
 from compgs import __version__, metrics
 from compgs.cameras import Camera
+from compgs.devices import chosen_device, device_name
 from compgs.errors import SceneError
 from compgs.evaluation.camera_path import camera_entry
 from compgs.evaluation.contact_sheet import contact_sheet, striped
@@ -25,6 +26,9 @@ from compgs.render import Renderable, render
 from compgs.scene import as_scene
 from compgs.scene.views import Scene, View
 
+if TYPE_CHECKING:
+    from compgs.devices import Device
+
 SHEET_ROWS = 4  # views on the contact sheet
 
 
@@ -35,7 +39,7 @@ def evaluate(
     output: str | Path | None = None,
     overwrite: bool = False,
     lpips: bool = False,
-    device: str | torch.device | None = None,
+    device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
     method: str | None = None,
     exposure: bool = False,
@@ -64,7 +68,7 @@ def evaluate(
         raise SceneError(
             f"{scene.name}: no view is held out, so there is nothing to evaluate on; load with hold-out"
         )
-    chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    chosen = chosen_device(device)
     model, first_seconds = timed_decode(path, chosen, scene.background)
     model, decode_seconds = timed_decode(path, chosen, scene.background)
 
@@ -152,11 +156,6 @@ def timed_render(model: Renderable, camera: Camera) -> tuple[np.ndarray, float]:
     return image, working_seconds() - start
 
 
-def device_name(device: torch.device) -> str:
-    """`cpu`, or the name of the GPU."""
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
-
-
 def write_evaluation(
     folder: Path, results: Results, views: tuple[View, ...], images: list[np.ndarray]
 ) -> None:
@@ -203,9 +202,7 @@ def encode_png(image: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def timed_decode(
-    path: Path, device: torch.device, background: tuple[float, float, float]
-) -> tuple[Renderable, float]:
+def timed_decode(path: Path, device: str, background: tuple[float, float, float]) -> tuple[Renderable, float]:
     """The model, and the seconds from file to model."""
     start = working_seconds()
     model = open_scene(path, device, background)

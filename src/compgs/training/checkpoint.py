@@ -146,7 +146,8 @@ def read_checkpoint_file(path: Path, method: str) -> tuple[dict[str, Tensor], di
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            # Copies: on Windows a file that is mapped could not be replaced by the run's next checkpoint.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     # (the last three: of tensors that the header describes in a way that torch cannot have)
     except (OSError, safetensors.SafetensorError, ValueError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error

@@ -68,7 +68,7 @@ def train_phases(
         if run.profile is not None:
             run.profile.watch(trainer, PARTS, stations)
         before = sum(phase.config.training.steps for phase in phases[:index])
-        trainer.run(run.checkpoint, _of_whole(run.on_progress, before, total))
+        trainer.run(run.checkpoint, _of_whole(run.on_progress, before, total), run.watch)
     assert trainer is not None
     return trainer
 

@@ -15,13 +15,16 @@ from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
+from compgs.devices import placed
 from compgs.gaussians import Gaussians
 from compgs.losses import photometric_loss
-from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
-from compgs.render import RasterResult, RasterSettings, visible_mask
+from compgs.model.splats import SplatModel
+from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
+from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
+from compgs.tensors.visibility import visible_mask
 from compgs.training.checkpoint import (
     check_same_run,
     optimizer_tensors,
@@ -36,6 +39,7 @@ from compgs.training.loop import (
     Run,
     StepResult,
     TrainingStatus,
+    Watch,
     chosen_config,
     rasterize_step,
     run_to_end,
@@ -121,7 +125,7 @@ class SplatTrainer:
         splats = (
             initial_splats(scene.points, config.splats)
             if start is None
-            else of_degree(start.splats, config.splats.harmonics)
+            else of_degree(Splats.of(start.splats), config.splats.harmonics)
         )
         self.parameters = SplatParameters(splats.to(device))
         self.optimizer = make_splat_optimizer(self.parameters, config.splats, scene.extent)
@@ -245,10 +249,15 @@ class SplatTrainer:
 
     # the run -------------------------------------------------------------------------------------------------------
 
-    def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
+    def run(
+        self,
+        path: Path | None,
+        on_progress: Callable[[TrainingStatus], None] | None,
+        watch: Watch | None = None,
+    ) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         check_points_seen(self.scene, self.settings.near_plane)
-        run_to_end(self, self.config.training, path, on_progress)
+        run_to_end(self, self.config.training, path, on_progress, watch)
 
     def estimated_bytes(self) -> int:
         """Size of the method's file if it were written now; of a .ply file without its header."""
@@ -261,9 +270,14 @@ class SplatTrainer:
         """Plain 3DGS has nothing left to do: the file holds the splats as they are."""
         self.hooks.finish(self)
 
+    def snapshot(self) -> SplatModel:
+        """Before any `transform`, for which a hook may draw random numbers."""
+        return self.model()
+
     def model(self) -> SplatModel:
         """The splats of now, before any `transform`."""
-        return SplatModel(self.parameters.trained(), self.scene.background, self.world_offset)
+        arrays = self.parameters.trained().arrays(self.world_offset)
+        return placed(SplatModel(arrays, self.scene.background), self.device)
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
@@ -310,7 +324,7 @@ class SplatTrainer:
             check_step(state, config.training.steps)
             parts = tensors_by_kind(tensors)
             x, y, z = finite(state.get("world_offset", [0.0] * 3), 3, "world_offset")  # older ones have none
-            start = SplatModel(checked_splats(parts["model"]), scene.background, (x, y, z))
+            start = SplatModel(checked_splats(parts["model"]).arrays((x, y, z)), scene.background)
         trainer = cls(scene, config, device, start, hooks, phase=phase, method=method)
         with restoring(path):
             extra = parts["extra"]

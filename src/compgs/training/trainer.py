@@ -23,11 +23,13 @@ from compgs.losses import (
     scale_regularizer,
     scale_unit,
 )
-from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
-from compgs.render import RasterResult, RasterSettings, visible_mask
+from compgs.model.hybrid_model import HybridModel
+from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
+from compgs.tensors.prediction import Prediction, camera_center, choosing_pays, predict
+from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
 from compgs.training.checkpoint import (
     Checkpoint,
@@ -48,6 +50,7 @@ from compgs.training.loop import (
     Run,
     StepResult,
     TrainingStatus,
+    Watch,
     chosen_config,
     diverged,
     rasterize_step,
@@ -99,7 +102,7 @@ def train_hybrid(scene: Scene, config: Config, run: Run) -> TrainedModel:
         trainer = Trainer(scene, config, run.device)
     if run.profile is not None:
         run.profile.watch(trainer, PARTS, stations)
-    trainer.run(run.checkpoint, run.on_progress)
+    trainer.run(run.checkpoint, run.on_progress, run.watch)
     return trainer.model
 
 
@@ -326,10 +329,19 @@ class Trainer:
 
     # the run -------------------------------------------------------------------------------------------------------
 
-    def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
+    def run(
+        self,
+        path: Path | None,
+        on_progress: Callable[[TrainingStatus], None] | None,
+        watch: Watch | None = None,
+    ) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         check_points_seen(self.scene, self.settings.near_plane)
-        run_to_end(self, self.config.training, path, on_progress)
+        run_to_end(self, self.config.training, path, on_progress, watch)
+
+    def snapshot(self) -> HybridModel:
+        """What the file would hold of the scene now, but for primitives that the end of the run removes."""
+        return self.model.as_hybrid_model(stored_weights=self.stored)
 
     @property
     def primitives(self) -> int:
