@@ -17,10 +17,9 @@ depends on neither the number of threads nor their timing.
 """
 
 import numpy as np
-from numba import prange
 
 from compgs.model.constants import NEGATIVE_SLOPE
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 
 ANCHORS = 128  # in a block
 ROWS = 128  # primitives in a group: all activations of a group fit into the second-level cache
@@ -66,7 +65,8 @@ def tiled(biases):
     tiles = np.empty((len(biases), ROWS * H), np.float32)
     for b in range(len(biases)):
         for i in range(ROWS):
-            tiles[b, i * H : (i + 1) * H] = biases[b]
+            for c in range(H):
+                tiles[b, i * H + c] = biases[b, c]
     return tiles
 
 
@@ -102,9 +102,10 @@ def begin(
     anchor_entry,  # [F, H + O]
     entry_bias,  # [H + O]
     shared,  # [A, H + O], written
+    share,
 ):
     """The anchors' part of the first layer and of the skip, biases included."""
-    for block in prange((len(features) + ANCHORS - 1) // ANCHORS):
+    for block in portion((len(features) + ANCHORS - 1) // ANCHORS, share):
         first, last = block * ANCHORS, min(len(features), (block + 1) * ANCHORS)
         begin_block(features[first:last], anchor_entry, entry_bias, shared[first:last])
 
@@ -142,6 +143,7 @@ def forward(
     biases2,
     output_weight,
     out,  # [M, O], written
+    share,
 ):
     M, G, blocks = len(index), len(residual_entry), len(weights1)
     H, O = output_weight.shape
@@ -149,7 +151,7 @@ def forward(
     # Several groups to a task: scratch memory is allocated once per task.
     tasks = min(groups, 8 * CHUNKS)
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
-    for t in prange(tasks):
+    for t in portion(tasks, share):
         own = np.empty((ROWS, G), np.float32)
         first = np.empty((ROWS, H + O), np.float32)
         x = np.empty((blocks + 1, ROWS, H), np.float32)
@@ -216,6 +218,7 @@ def backward(
     # [chunks, size] zero, written: residual entry, per block weight 1, bias 1, weight 2, bias 2, then output weight;
     # [chunks, 0] if not wanted
     d_weights,
+    share,
 ):
     G, blocks = len(residual_entry), len(weights1)
     H, O = output_weight.shape
@@ -225,9 +228,11 @@ def backward(
     entry_t, output_t = np.ascontiguousarray(residual_entry.T), np.ascontiguousarray(output_weight.T)
     weights1_t, weights2_t = np.empty_like(weights1), np.empty_like(weights2)
     for b in range(blocks):
-        weights1_t[b], weights2_t[b] = weights1[b].T, weights2[b].T
+        for i in range(H):
+            for j in range(H):
+                weights1_t[b, j, i], weights2_t[b, j, i] = weights1[b, i, j], weights2[b, i, j]
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
-    for c in prange(len(bounds) - 1):
+    for c in portion(len(bounds) - 1, share):
         own = np.empty((ROWS, G), np.float32)
         first = np.empty((ROWS, F), np.float32)
         x = np.empty((blocks + 1, ROWS, H), np.float32)
