@@ -29,6 +29,7 @@ ALLOWED = {
         "evaluation",
         "formats",
         "exporting",
+        "methods",
     },
     "errors": set(),
     "interrupt": set(),
@@ -47,15 +48,18 @@ ALLOWED = {
     "stored_weights": BASE | {"model", "entropy"},
     "trained_model": BASE | {"model", "entropy", "stored_weights"},
     "codec": BASE | {"model", "entropy", "trained_model"},
-    "formats": BASE | {"model", "render", "codec"},
+    "formats": BASE | {"model", "render", "codec", "methods"},  # up for a method's own files, which name it
     "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
+    "methods": BASE
+    | {"scene", "model", "entropy", "render", "losses", "metrics", "codec", "formats"}
+    | {"training", "trained_model", "stored_weights"},
     "reconstruct": BASE | {"scene"},
     "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
     "viewer": BASE,
     "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},
     "cli": BASE
     | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "viewer", "reconstruct"},
+    | {"trained_model", "exporting", "viewer", "methods", "reconstruct"},
     "__main__": BASE | {"cli"},
 }
 
@@ -120,6 +124,12 @@ def test_formats_are_read_and_written_without_torch() -> None:
     loaded = modules_after("import compgs.formats")
     assert "compgs.formats.sog" in loaded
     assert not loaded & {"torch", "numba", "scipy"}
+
+
+def test_methods_are_named_without_what_trains_them() -> None:
+    loaded = modules_after("import compgs.methods; compgs.methods.settings_of('3dgs')")
+    assert "compgs.methods.splats" in loaded
+    assert not loaded & {"torch", "numba", "scipy", "compgs.training"}
 
 
 def test_the_command_line_starts_without_torch() -> None:

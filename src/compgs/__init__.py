@@ -28,12 +28,13 @@ started = time.time()
 
 _HOME = {
     "load_scene": "compgs.scene",
-    "train": "compgs.training",
+    "train": "compgs.methods",
     "encode": "compgs.codec",
     "decode": "compgs.codec",
     "render": "compgs.render",
     "evaluate": "compgs.evaluation",
     "compare": "compgs.evaluation",
+    "report": "compgs.evaluation.reports",
     "export": "compgs.exporting",
     "open_scene": "compgs.formats",
     "load_config": "compgs.config",
@@ -56,6 +57,7 @@ __all__ = [
     "load_scene",
     "open_scene",
     "render",
+    "report",
     "train",
 ]
 
@@ -66,15 +68,18 @@ if TYPE_CHECKING:
     from compgs.errors import CompGSError
     from compgs.evaluation import compare as compare
     from compgs.evaluation import evaluate as evaluate
+    from compgs.evaluation.reports import report as report
     from compgs.exporting import export
     from compgs.formats import open_scene
     from compgs.gaussians import Gaussians
+    from compgs.methods import train
     from compgs.render import render
     from compgs.scene import load_scene
-    from compgs.training import train
 
 
 def __getattr__(name: str) -> object:
+    if name == "methods":
+        return importlib.import_module("compgs.methods")
     if name not in _HOME:
         raise AttributeError(f"module 'compgs' has no attribute {name!r}")
     return getattr(importlib.import_module(_HOME[name]), name)

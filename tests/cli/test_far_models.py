@@ -9,10 +9,10 @@ import torch
 
 import compgs.codec
 from compgs.cli.decode import Decode
-from compgs.cli.methods import METHODS
 from compgs.cli.render import Render
 from compgs.config import Config, ModelConfig
 from compgs.formats import read_ply
+from compgs.methods import write
 from compgs.model.splats import SplatModel, Splats
 from compgs.trained_model import TrainedModel
 
@@ -49,5 +49,6 @@ def test_the_splats_file_of_a_run_is_in_world_coordinates(tmp_path: Path) -> Non
     means = torch.tensor([[1.0, 2.0, 3.0], [0.0, 0.5, -0.25]])
     rest, quaternions = torch.zeros(2, 0, 3), torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1)
     splats = Splats(means, torch.zeros(2, 3), quaternions, torch.zeros(2), torch.zeros(2, 3), rest)
-    METHODS["3dgs"].write(SplatModel(splats, (0.0, 0.0, 0.0), (1000.0, -64.0, 0.5)), tmp_path / "a.ply")
+    model = SplatModel(splats, (0.0, 0.0, 0.0), (1000.0, -64.0, 0.5))
+    write(model, tmp_path / "a.ply", method="3dgs")
     assert read_ply(tmp_path / "a.ply").means.tolist() == [[1001.0, -62.0, 3.5], [1000.0, -63.5, 0.25]]

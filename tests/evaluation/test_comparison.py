@@ -221,7 +221,7 @@ def test_what_is_written_says_what_was_found(walls: tuple[Path, Path], tmp_path:
     assert [name for name, _ in read_cameras(out / "cameras.json")] == ["0.jpg", "1.jpg", "2.jpg"]
     for folder, level in (("a", 100), ("b", 110), ("gt", 95)):
         assert (np.asarray(Image.open(out / folder / "00002.png")) == level).all()
-    assert rows[0]["difference_scale"] == 16
+    assert [row["difference_scale"] for row in rows] == [16] * 3
     difference = np.asarray(Image.open(out / "difference" / "00002.png"))
     assert difference.shape == (HEIGHT, WIDTH, 3) and np.ptp(difference.reshape(-1, 3), axis=0).max() == 0
     assert [path.name for path in out.parent.iterdir()] == ["out"]

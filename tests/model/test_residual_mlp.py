@@ -80,6 +80,7 @@ def test_other_types_take_the_torch_path_with_the_same_result():
         torch.testing.assert_close(a, b)
 
 
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
 def test_results_are_the_same_bits_with_one_thread_and_with_several():
     mlp = layers(36, 8, 4, 32, 1)
     f, g, index = inputs(mlp, 500, 4000)

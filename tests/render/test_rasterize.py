@@ -140,6 +140,16 @@ def test_gaussians_before_the_near_plane_get_exactly_zero_gradients():
     assert found["means"][2].abs().max() > 0
 
 
+@pytest.mark.parametrize("near", [None, 0.5])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_near_plane_is_a_hundredth_of_a_unit_or_where_the_settings_have_it(near, dtype):
+    at = near or 0.01
+    gaussians = leaves(on_axis([0.99 * at, 1.01 * at, 2.0], [0.5, 0.5, 0.5]), dtype)
+    settings = RasterSettings() if near is None else RasterSettings(near_plane=near)
+    result = rasterize(gaussians, straight_camera(), settings)
+    assert result.visible.tolist() == [False, True, True]
+
+
 def test_no_gaussians_give_the_background():
     empty = leaves(make_gaussians(0), torch.float32)
     empty = Gaussians(*(getattr(empty, n)[:0].detach().requires_grad_() for n in FIELDS))

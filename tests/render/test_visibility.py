@@ -1,6 +1,7 @@
 """The frustum test must not lose anything that would be drawn."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -60,6 +61,15 @@ def test_anchors_behind_or_far_beside_the_camera_are_not_visible():
     positions = torch.tensor([[0.0, 0, 5], [0, 0, -5], [10, 0, 5], [-10, 0, 5], [0, 10, 5], [0, -10, 5]])
     mask = visible_mask(positions, torch.full((6,), 0.1), camera, SETTINGS)
     assert mask.tolist() == [True, False, False, False, False, False]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_anchors_that_do_not_reach_the_near_plane_are_not_visible(dtype):
+    camera = Camera(np.eye(4), 50.0, 50.0, 20.0, 15.0, 40, 30)
+    positions = torch.tensor([[0, 0, 0.3], [0, 0, 0.3], [0, 0, 0.6], [0, 0, -1.0]], dtype=dtype)
+    radii = torch.tensor([0.19, 0.21, 0.0, 1.51], dtype=dtype)
+    mask = visible_mask(positions, radii, camera, RasterSettings(near_plane=0.5))
+    assert mask.tolist() == [False, True, True, True]
 
 
 def test_no_anchors_give_an_empty_mask():

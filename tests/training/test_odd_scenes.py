@@ -259,7 +259,7 @@ def test_the_unit_of_length_does_not_matter(config: Config) -> None:
     near, far = (trained(each, few_steps(config)) for each in (scene, scaled(scene, 1024.0)))
     assert torch.equal(near.coordinates, far.coordinates)
     for name, value in near.named_parameters():
-        assert torch.allclose(value, far.get_parameter(name), atol=1e-4), name
+        assert torch.equal(value, far.get_parameter(name)), name
 
 
 def few_steps(config: Config) -> Config:

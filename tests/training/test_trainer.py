@@ -74,12 +74,22 @@ def test_a_higher_lambda_spends_fewer_bits(blob_scene, tiny_config):
 
 
 def test_primitives_that_no_view_sees_are_dropped_at_the_end(blob_scene, tiny_config):
-    trainer = Trainer(blob_scene, tiny_config, CPU)
+    config = replace(
+        tiny_config,
+        control=replace(tiny_config.control, prune_at=()),
+        training=replace(tiny_config.training, steps=2),
+    )
+    trainer = Trainer(blob_scene, config, CPU)
+    hidden = torch.zeros(trainer.model.anchors, dtype=torch.bool)
+    hidden[::5] = True
+    trainer.model.coordinates[hidden, 2] += 10_000  # far above all cameras
     trainer.run(None, None)
     mask = trainer.model.mask
-    assert mask.any() and mask.shape == (trainer.model.anchors, 4)
+    assert not mask[hidden].any()
+    assert mask[~hidden].any(1).float().mean() > 0.7
     hybrid = trainer.model.as_hybrid_model()
     assert hybrid.coupled == int(mask.sum())
+    assert hybrid.primitives.positions.shape == (trainer.model.anchors, 3)
 
 
 def test_one_object_on_white_does_not_vanish(blob_scene, tiny_config):

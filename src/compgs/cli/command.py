@@ -36,8 +36,13 @@ class ComputingCommand(Command):
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint=NO_DEFAULT)] = None
     """Where to compute; a CUDA GPU by default where there is one."""
 
-    def prepare(self) -> None:
-        """Apply `threads`, check `device`. Raises UsageError, ConfigError."""
+    def prepare(self, *stages: str) -> None:
+        """Apply `threads`, check `device`; let helpers compile what some stages of work need, where nothing has been
+        compiled yet. Raises UsageError, ConfigError."""
+        if self.threads != 1 and self.device in (None, "cpu"):
+            from compgs.numerics.ahead import start_helpers
+
+            start_helpers(*stages)
         if self.threads is not None:
             use_threads(self.threads)
         if self.device is not None:

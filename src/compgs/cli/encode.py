@@ -76,7 +76,7 @@ class Encode(ComputingCommand, ReadingOptions):
 
     def run(self) -> None:
         path = self.check()
-        self.prepare()
+        self.prepare("encode")
         start = time.perf_counter()
         data = self.encoded_run() if self.source.is_dir() else read_bitstream(self.source)
         if self.reduces:

@@ -24,6 +24,7 @@ from compgs.cli.export import Export
 from compgs.cli.info import Info
 from compgs.cli.reconstruct import Reconstruct
 from compgs.cli.render import Render
+from compgs.cli.report import Report
 from compgs.cli.serve import Serve
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError, in_words_of_options
@@ -38,6 +39,7 @@ COMMANDS: tuple[type[Command], ...] = (
     Render,
     Evaluate,
     Compare,
+    Report,
     Export,
     Serve,
     Info,

@@ -14,7 +14,7 @@ from compgs import __version__, metrics
 from compgs.cameras import Camera
 from compgs.errors import SceneError
 from compgs.evaluation.camera_path import camera_entry
-from compgs.evaluation.contact_sheet import contact_sheet
+from compgs.evaluation.contact_sheet import contact_sheet, striped
 from compgs.evaluation.fit import misfits
 from compgs.evaluation.results import Results, ViewResult
 from compgs.formats import component_bytes, open_scene
@@ -36,16 +36,22 @@ def evaluate(
     lpips: bool = False,
     device: str | torch.device | None = None,
     progress: Callable[[int, int], None] | None = None,
+    method: str | None = None,
 ) -> Results:
     """Open a file of any known format (`compgs.formats`) and compare its renderings with a scene's held-out views.
 
     Metrics are of 8-bit images (`compgs.metrics`). A scene that is given as a folder is read as `load_scene(folder)`
     does. With `output`, a folder, `results.json` and `per_view.json` (their schema: `compgs.evaluation.results`),
-    `cameras.json` (of the held-out views), `test/renders`, `test/gt` and `contact_sheet.png` are written there.
-    `progress(done, total)` is called after each view. Where the file tells that it was made from another scene, or from
+    `cameras.json` (of the held-out views), `test/renders`, `test/gt`, `test/masks` (of views that have one: white where
+    a pixel counts) and `contact_sheet.png` are written there.
+    `progress(done, total)` is called after each view; `method` is noted: which one wrote the file. Where the file
+    tells that it was made from another scene, or from
     views or sizes of images other than these, `notes` of the results say so.
 
-    Raises BitstreamError, SplatFileError, SceneError if the scene holds no view out, OutputError.
+    Pixels that a view's mask leaves out do not count.
+
+    Raises BitstreamError, SplatFileError, OutputError, and SceneError if the scene holds no view out or a mask leaves
+    nothing.
     """
     path, scene = Path(file), as_scene(scene)
     if output is not None:
@@ -66,18 +72,19 @@ def evaluate(
     images: list[np.ndarray] = []
     for i, view in enumerate(scene.test_views):
         image, seconds = timed_render(model, view.camera)
+        mask = counted_pixels(view)
         distance: float | None = None
         if lpips_note is None:
             try:
-                distance = metrics.lpips(image, view.image)
+                distance = metrics.lpips(image, view.image, mask=mask)
             except metrics.Unavailable as reason:
                 lpips_note = f"unavailable: {reason}"
         rows.append(
             ViewResult(
                 name=view.name,
                 file=f"{i:05d}.png",
-                psnr=metrics.psnr(image, view.image),
-                ssim=metrics.ssim(image, view.image),
+                psnr=metrics.psnr(image, view.image, mask),
+                ssim=metrics.ssim(image, view.image, mask),
                 lpips=distance,
                 render_seconds=seconds,
             )
@@ -102,12 +109,23 @@ def evaluate(
         threads=numba.get_num_threads(),
         sha256=hashlib.sha256(data).hexdigest(),
         lpips_note=lpips_note,
+        method=method,
         per_view=tuple(rows),
         notes=misfits(model.viewpoints, scene),
     )
     if output is not None:
         write_evaluation(Path(output), results, scene.test_views, images)
     return results
+
+
+def counted_pixels(view: View) -> np.ndarray | None:
+    """The view's mask. Raises SceneError if it leaves nothing to compare."""
+    mask = view.mask
+    if mask is not None and not mask.any():
+        raise SceneError(
+            f"{view.name}: its mask leaves no pixel to evaluate on; mend the mask, or remove the view from the poses"
+        )
+    return mask
 
 
 def timed_render(model: Renderable, camera: Camera) -> tuple[np.ndarray, float]:
@@ -126,18 +144,33 @@ def write_evaluation(
     folder: Path, results: Results, views: tuple[View, ...], images: list[np.ndarray]
 ) -> None:
     """The files of an evaluation; images of an earlier one with more views are removed."""
-    renders, photographs = folder / "test" / "renders", folder / "test" / "gt"
+    written: set[Path] = set()
+    renders, photographs, masks = (folder / "test" / name for name in ("renders", "gt", "masks"))
+
+    def write(path: Path, image: np.ndarray) -> None:
+        write_bytes(path, encode_png(image))
+        written.add(path)
+
     for row, view, image in zip(results.per_view, views, images, strict=True):
-        write_bytes(renders / row.file, encode_png(image))
-        write_bytes(photographs / row.file, encode_png(view.image))
-    names = {row.file for row in results.per_view}
-    for place in (renders, photographs):
+        write(renders / row.file, image)
+        write(photographs / row.file, view.image)
+        if (mask := view.mask) is not None:
+            write(masks / row.file, mask.astype(np.uint8) * np.uint8(255))
+    for place in (renders, photographs, masks):
         for old in place.glob("[0-9][0-9][0-9][0-9][0-9].png"):
-            if old.name not in names:
+            if old not in written:
                 old.unlink(missing_ok=True)
     chosen = np.unique(np.linspace(0, len(views) - 1, min(SHEET_ROWS, len(views))).round().astype(int))
     sheet = contact_sheet(
-        [(views[i].image, images[i], views[i].name, results.per_view[i].psnr) for i in chosen],
+        [
+            (
+                striped(views[i].image, views[i].mask),
+                striped(images[i], views[i].mask),
+                views[i].name,
+                results.per_view[i].psnr,
+            )
+            for i in chosen
+        ],
         f"{results.scene}: {results.bytes / 1000:.1f} kB, {results.psnr:.2f} dB, {len(views)} held-out views",
     )
     write_bytes(folder / "contact_sheet.png", encode_png(sheet))
@@ -147,7 +180,7 @@ def write_evaluation(
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Of a [H, W, 3] uint8 image."""
+    """Of a [H, W, 3] or [H, W] uint8 image."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="PNG")
     return buffer.getvalue()

@@ -17,6 +17,7 @@ from compgs.codec.reduce import with_coarser_covariances, without_coupled
 from compgs.codec.writer import Geometry, write_content
 from compgs.errors import ConfigError
 from compgs.evaluation.importance import importance
+from compgs.evaluation.measure import counted_pixels
 from compgs.model.hybrid_model import HybridModel
 from compgs.render import render
 from compgs.scene.views import View
@@ -137,5 +138,6 @@ def _image(model: HybridModel, camera: Camera) -> np.ndarray:
 
 
 def _side(data: bytes, model: HybridModel, held_out: Sequence[View]) -> Side:
-    psnr = fmean(metrics.psnr(_image(model, v.camera), v.image) for v in held_out) if held_out else None
+    psnrs = [metrics.psnr(_image(model, view.camera), view.image, counted_pixels(view)) for view in held_out]
+    psnr = fmean(psnrs) if psnrs else None
     return Side(len(data), model.anchors, model.coupled, psnr)

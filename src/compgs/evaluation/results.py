@@ -7,6 +7,7 @@
 | schema | "compgs results 1" |
 | compgs | version of the program that evaluated |
 | scene, file | names |
+| method | that wrote the file, if a run evaluated it; else null |
 | views, width, height | number of held-out views; pixels of the first |
 | psnr | dB, mean over the views; null if infinite: all renderings are perfect |
 | ssim | mean over the views |
@@ -65,6 +66,7 @@ class Results:
     threads: int
     sha256: str
     lpips_note: str | None  # why there is no LPIPS
+    method: str | None  # that wrote the file, where it is known
     per_view: tuple[ViewResult, ...]
     notes: tuple[str, ...] = ()  # in what the scene is not what the file was trained on (`evaluation/fit.py`)
 
@@ -108,6 +110,7 @@ class Results:
             "compgs": self.compgs,
             "scene": self.scene,
             "file": self.file,
+            "method": self.method,
             "views": len(self.per_view),
             "width": self.width,
             "height": self.height,

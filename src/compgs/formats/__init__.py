@@ -8,6 +8,7 @@
 | .sog 2, zip or meta.json | yes | yes | about 20 |
 | .glb, KHR_gaussian_splatting | yes | yes | 240 |
 | .splat | yes | no | 32, no harmonics |
+| .packed, of a method of the comparison | yes | by `compgs.methods.write` | |
 """
 
 from compgs.formats.arrays import SplatArrays, arrays_of

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compgs.errors import NotACompGSFile, OutputError, SplatFileError
-from compgs.formats import cgs, glb, ply, sog, splat, spz
+from compgs.formats import cgs, glb, packed, ply, sog, splat, spz
 from compgs.formats.arrays import SplatArrays
 
 if TYPE_CHECKING:
@@ -45,6 +45,17 @@ def _open_cgs(path: Path, device: "torch.device | str", background: Background) 
     return cgs.read(path, device)
 
 
+def _open_packed(path: Path, device: "torch.device | str", background: Background) -> "Renderable":
+    from compgs.methods import METHODS  # the only way up: a method's file says which method reads it
+
+    content = packed.read(path)
+    method = METHODS.get(content.method)
+    if method is None or method.open is None:
+        known = ", ".join(name for name, each in METHODS.items() if each.open) or "none"
+        raise SplatFileError(f"{path}: a file of method {content.method}; known here are those of {known}")
+    return method.open(content, device, background)
+
+
 # In the order in which they are asked; .splat, which nothing marks, is the last.
 FORMATS = (
     Format("cgs", cgs.begins, cgs.check, cgs.component_bytes, _open_cgs),
@@ -52,6 +63,7 @@ FORMATS = (
     Format("spz", spz.begins, spz.check, spz.component_bytes, _opens_splats(spz.read)),
     Format("sog", sog.begins, sog.check, sog.component_bytes, _opens_splats(sog.read)),
     Format("glb", glb.begins, glb.check, glb.component_bytes, _opens_splats(glb.read)),
+    Format("packed", packed.begins, packed.check, packed.component_bytes, _open_packed),
     Format("splat", splat.begins, splat.check, splat.component_bytes, _opens_splats(splat.read)),
 )
 

@@ -234,8 +234,9 @@ def run_to_end(
 
 
 def _status(trainer: Trains, steps: int, result: StepResult, estimate: int, pace: float) -> TrainingStatus:
-    photograph = result.photograph.image.to(result.image.dtype) / 255.0
-    error = float(((result.image.clamp(0, 1) - photograph) ** 2).mean())
+    photograph, counted = result.photograph.image.to(result.image.dtype) / 255.0, result.photograph.counted
+    squares = (result.image.clamp(0, 1) - photograph) ** 2
+    error = float((squares if counted is None else squares[counted]).mean())
     psnr = -10.0 * float(np.log10(max(error, 1e-10)))
     return TrainingStatus(
         step=trainer.step,

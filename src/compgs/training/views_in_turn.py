@@ -40,10 +40,10 @@ class ViewsInTurn:
         GPU once and kept there while there is room.
         """
         if self.device.type == "cpu":
-            return Target.from_image(self.views[index].image)
+            return Target.from_image(self.views[index].image, mask=self.views[index].mask)
         kept = self.photographs
         if index not in kept:
-            target = Target.from_image(self.views[index].image, self.device)
+            target = Target.from_image(self.views[index].image, self.device, self.views[index].mask)
             while kept and sum(t.image.numel() for t in kept.values()) + target.image.numel() > KEPT_BYTES:
                 del kept[next(iter(kept))]
             kept[index] = target
