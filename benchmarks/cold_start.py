@@ -5,8 +5,8 @@
     python benchmarks/cold_start.py --list     writes the list of what helpers compile: src/compgs/numerics/kernels.json
 
 Each job is a new process with an empty folder of kernels. It begins when Python does, imports included; the work
-itself takes a fraction of a second, on a scene that is made for it. Processor seconds are of the job's process; with
-one core there are no helpers, so that these are all that is compiled.
+itself takes a fraction of a second, on a scene that is made for it. Processor seconds are those of the job's process,
+without its helpers'; on one core there are none. On a busy machine they tell more than the wall does.
 """
 
 import argparse
@@ -152,8 +152,8 @@ def main() -> None:
             together = measured(name, folder, one_core=False)
             alone = measured(name, folder, one_core=True)
             print(
-                f"{name:8} {together['wall']:5.1f} s with all cores, {alone['wall']:5.1f} s with one, of these "
-                f"{alone['processor']:5.1f} s processor: {JOBS[name]}",
+                f"{name:8} all cores: {together['wall']:5.1f} s, of these {together['processor']:5.1f} s processor; "
+                f"one core: {alone['wall']:5.1f} s, {alone['processor']:5.1f} s processor: {JOBS[name]}",
                 flush=True,
             )
             if options.kernels:

@@ -12,6 +12,9 @@ Python leave out:
     double(x, y)
 
 Shares are contiguous. What stands before the loop is done by every thread. Arrays of one call must not overlap.
+
+Any number of Python threads may call kernels at the same time. Processes are to be started with `spawn`: kernels run
+in forked ones, too, but torch's threads do not survive a fork.
 """
 
 from collections.abc import Callable
