@@ -57,7 +57,7 @@ def train(folder: Path) -> Any:
 def encode(folder: Path) -> None:
     import compgs
 
-    compgs.encode(train(folder), folder / "again.cgs")
+    compgs.encode(train(folder), folder / "again.cgs", overwrite=True)
 
 
 def job(name: str, folder: Path, started: float) -> None:

@@ -7,7 +7,8 @@ import torch
 
 from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer, scale_unit
 from compgs.numerics import ssim as ssim_module
-from compgs.numerics.ssim import l1_and_ssim, ssim, window
+from compgs.numerics.ssim import l1_and_ssim, window
+from compgs.tensors.ssim import ssim
 
 
 def pair(height, width, seed=0):

@@ -8,7 +8,7 @@ from torch import nn
 
 from compgs import metrics
 from compgs.errors import CompGSError
-from compgs.numerics.ssim import ssim
+from compgs.tensors.ssim import ssim
 
 RNG = np.random.default_rng(0)
 PHOTOGRAPH = RNG.integers(0, 256, (40, 50, 3), dtype=np.uint8)
@@ -33,6 +33,13 @@ def test_identical_images_have_infinite_psnr_and_an_ssim_of_one():
     assert metrics.ssim(PHOTOGRAPH, PHOTOGRAPH.copy()) == pytest.approx(1.0, abs=1e-6)
 
 
+def test_of_pictures_that_may_be_equal_the_mean_is_finite_unless_all_are():
+    assert metrics.mean_psnr([30.0, 40.0]) == 35.0
+    assert metrics.mean_psnr([math.inf, 40.0]) == 70.0
+    assert metrics.mean_psnr([120.0, 40.0]) == 70.0
+    assert metrics.mean_psnr([math.inf, math.inf]) == math.inf
+
+
 @pytest.mark.parametrize("metric", [metrics.psnr, metrics.ssim])
 def test_metrics_are_symmetric_and_fall_with_the_disturbance(metric):
     values = [metric(PHOTOGRAPH, disturbed(amount)) for amount in (2, 20, 100)]
@@ -50,7 +57,7 @@ def test_ssim_agrees_with_float64():
 
 
 def test_renderings_are_rounded_and_clamped_not_truncated():
-    image = torch.tensor([[[0.9 / 255, 0.4 / 255, 254.6 / 255], [-0.3, 1.7, 1.0]]])
+    image = np.array([[[0.9 / 255, 0.4 / 255, 254.6 / 255], [-0.3, 1.7, 1.0]]], np.float32)
     assert metrics.to_8bit(image).tolist() == [[[1, 0, 255], [0, 255, 255]]]
 
 

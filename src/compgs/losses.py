@@ -25,7 +25,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.numerics.ssim import l1_and_ssim, ssim
+from compgs.numerics.ssim import l1_and_ssim
+from compgs.tensors.ssim import ssim
 
 COMMON_EXTENT = 5.0  # world units
 REVIVED = 0.05  # opacity, well above the rasterizer's cutoff
@@ -41,6 +42,7 @@ class Target:
 
     image: Tensor  # [H, W, 3] uint8
     counted: Tensor | None = None  # [H, W] bool: pixels to compare; None: all
+    exposure: Tensor | None = None  # [3, 4] of the view, see `exposed`; None: the scene's own
 
     @staticmethod
     def from_image(
@@ -57,13 +59,21 @@ def _tensor(array: np.ndarray, device: torch.device | str) -> Tensor:
     return torch.from_numpy(np.require(array, requirements=("C", "W"))).to(device)
 
 
+def exposed(image: Tensor, exposure: Tensor | None) -> Tensor:
+    """[H, W, 3] as a camera of that exposure [3, 4] shows it: a matrix on each color, and an offset."""
+    return image if exposure is None else image @ exposure[:, :3].T + exposure[:, 3]
+
+
 def photometric_loss(
     image: Tensor,  # [H, W, 3] rendered, 0 to 1
     target: Target | Tensor,  # [H, W, 3] uint8, or of the image's type and 0 to 1
     ssim_weight: float = 0.2,
 ) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM), as in 3DGS; means over the pixels of the target that count (`numerics/ssim.py`)."""
-    y, counted = (target.image, target.counted) if isinstance(target, Target) else (target, None)
+    """(1 - w) L1 + w (1 - SSIM), as in 3DGS, at the target's exposure; means over its pixels that count
+    (`numerics/ssim.py`).
+    """
+    target = target if isinstance(target, Target) else Target(target)
+    y, counted, image = target.image, target.counted, exposed(image, target.exposure)
     assert image.shape == y.shape, f"image {tuple(image.shape)}, target {tuple(y.shape)}"
     if (
         image.device.type == "cpu"

@@ -20,28 +20,29 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from compgs.errors import MissingDependency, install_line
 from compgs.numerics.ssim import l1_and_ssim
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 SAME_PICTURE = 100.0  # dB, about what one level in one pixel of one channel comes to
 
-# Distance of two batches [1, 3, H, W] in [-1, 1].
-LpipsNetwork = Callable[[Tensor, Tensor], Tensor]
+# Distance of two batches [1, 3, H, W] in [-1, 1], of torch tensors.
+LpipsNetwork = Callable[[Any, Any], Any]
 
 
 class Unavailable(MissingDependency):
     """A metric that cannot be computed here; the message is the reason, for reports to print."""
 
 
-def to_8bit(image: Tensor) -> np.ndarray:
+def to_8bit(image: np.ndarray) -> np.ndarray:
     """[H, W, 3] rendered, 0 to 1 -> uint8: clamped and rounded."""
-    return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+    return np.rint(np.clip(np.asarray(image), 0.0, 1.0) * np.float32(255.0)).astype(np.uint8)
 
 
 def _check(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None) -> None:
@@ -95,6 +96,8 @@ def lpips(
         black = mask[:, :, None].astype(np.uint8)
         return lpips(a * black, b * black, network) / float(mask.mean())
     distance = lpips_network(network) if isinstance(network, str) else network
+    import torch
+
     inputs = [torch.tensor(image).permute(2, 0, 1)[None].float() / 127.5 - 1.0 for image in (a, b)]
     with torch.no_grad():
         return float(distance(*inputs))
@@ -104,11 +107,12 @@ def lpips(
 def lpips_network(name: Literal["vgg", "alex"]) -> LpipsNetwork:
     """The network with its published weights: torchmetrics, and a backbone in torch's checkpoint folder."""
     try:
+        import torch
         import torchvision
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     except (ImportError, RuntimeError) as error:  # a torchvision for another torch fails with RuntimeError
         raise Unavailable(
-            f"LPIPS needs torchmetrics and torchvision ({error}): {install_line('lpips')}"
+            f"LPIPS needs torch, torchmetrics and torchvision ({error}): {install_line('lpips')}"
         ) from error
     models = torchvision.models
     weights = {"vgg": models.VGG16_Weights, "alex": models.AlexNet_Weights}[name].IMAGENET1K_V1
@@ -119,7 +123,7 @@ def lpips_network(name: Literal["vgg", "alex"]) -> LpipsNetwork:
     network = LearnedPerceptualImagePatchSimilarity(net_type=name, normalize=False)
     network.eval()
 
-    def distance(a: Tensor, b: Tensor) -> Tensor:
+    def distance(a: "Tensor", b: "Tensor") -> "Tensor":
         network.reset()
         return network(a, b)
 

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from compgs import metrics
@@ -55,7 +54,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     module = "compgs.evaluation.measure"
 
     def render(model: StandIn, camera: Camera) -> SimpleNamespace:
-        return SimpleNamespace(image=torch.full((camera.height, camera.width, 3), model.level))
+        return SimpleNamespace(image=np.full((camera.height, camera.width, 3), model.level, np.float32))
 
     monkeypatch.setattr(f"{module}.open_scene", lambda path, device, background: StandIn(100 / 255))
     monkeypatch.setattr(f"{module}.component_bytes", lambda path: {"positions": 300, "weights": 700})
@@ -191,3 +190,17 @@ def test_masked_pixels_do_not_count_and_the_report_shows_them(file: Path, tmp_pa
 def test_a_mask_that_leaves_nothing_is_named(file: Path) -> None:
     with pytest.raises(SceneError, match=r"folder/1\.jpg: its mask leaves no pixel"):
         evaluate(file, masked(make_scene([1, 2]), {1: np.zeros((24, 32), dtype=bool)}), device="cpu")
+
+
+def test_with_exposure_the_right_half_is_measured_after_a_fit_to_the_left(file: Path) -> None:
+    """The file renders 100 everywhere; the photograph is 120 on the left, 130 on the right."""
+    scene = make_scene([120])
+    image = scene.test_views[0].image.copy()
+    image[:, 16:] = 130
+    views = (replace(scene.test_views[0], pixels=image),)
+    plain = evaluate(file, replace(scene, test_views=views), device="cpu")
+    results = evaluate(file, replace(scene, test_views=views), device="cpu", exposure=True)
+    assert results.psnr == pytest.approx(20 * math.log10(255 / 10), abs=1e-6)
+    assert results.psnr > plain.psnr
+    assert plain.to_dict()["exposure"] is None
+    assert "left half" in results.to_dict()["exposure"]

@@ -7,8 +7,8 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.config import SplatConfig
-from compgs.model.splats import Splats
-from compgs.render.reference import rotation_matrices
+from compgs.tensors.reference import rotation_matrices
+from compgs.tensors.splats import Splats
 from compgs.training.densification import (
     SPLIT_SHRINK,
     DensityControl,

@@ -28,6 +28,7 @@ from compgs.cli.report import Report
 from compgs.cli.serve import Serve
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError, in_words_of_options
+from compgs.cli.view import View
 from compgs.errors import CompGSError
 from compgs.interrupt import Terminated, ended_on_request, held_back
 
@@ -38,6 +39,7 @@ COMMANDS: tuple[type[Command], ...] = (
     Decode,
     Render,
     Evaluate,
+    View,
     Compare,
     Report,
     Export,

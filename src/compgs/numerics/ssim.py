@@ -1,4 +1,4 @@
-"""Structural similarity (Wang et al. 2004) as 3DGS computes it, alone and fused with L1 and the gradient.
+"""Structural similarity (Wang et al. 2004) as 3DGS computes it, fused with L1 and the gradient, on the CPU.
 
 `x` is the image, `y` the target, both [H, W, 3] in 0 to 1; every channel by itself. m, n are their local
 means under an 11 x 11 Gaussian window (sigma 1.5, zeros outside the image), v, w the local variances, c the
@@ -10,12 +10,9 @@ With a mask, pixels that do not count are treated as those outside of the image:
 them, and not averaged over.
 """
 
-import functools
 import math
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from compgs.numerics.compiled import njit, portion
 from compgs.numerics.vector_sums import add_in_any_order
@@ -31,29 +28,6 @@ def window() -> np.ndarray:
     offset = np.arange(WINDOW_SIZE) - WINDOW_SIZE // 2
     weight = np.exp(-0.5 * (offset / WINDOW_SIGMA) ** 2)
     return weight / weight.sum()
-
-
-@functools.lru_cache(maxsize=16)
-def window_on(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`window` on a device; kept, as a copy to a GPU waits for it to finish its work."""
-    return torch.as_tensor(window(), dtype=dtype, device=device)
-
-
-def ssim(x: Tensor, y: Tensor, counted: Tensor | None = None) -> Tensor:
-    """Mean SSIM of [H, W, 3] images over the pixels of a mask [H, W] bool, or all: plain torch, any device and type."""
-    if counted is not None:
-        x, y = (image * counted[:, :, None] for image in (x, y))
-    taps = window_on(x.dtype, x.device)
-
-    def blur(maps: Tensor) -> Tensor:  # [N, 1, H, W]
-        maps = torch.nn.functional.conv2d(maps, taps.view(1, 1, -1, 1), padding=(WINDOW_SIZE // 2, 0))
-        return torch.nn.functional.conv2d(maps, taps.view(1, 1, 1, -1), padding=(0, WINDOW_SIZE // 2))
-
-    maps = torch.cat([x, y, x * x, y * y, x * y], 2).permute(2, 0, 1)[:, None]
-    m, n, xx, yy, xy = blur(maps).view(5, 3, *x.shape[:2])
-    similarity = (2 * m * n + C1) * (2 * (xy - m * n) + C2)
-    similarity = similarity / ((m * m + n * n + C1) * (xx - m * m + yy - n * n + C2))
-    return similarity.mean() if counted is None else similarity[:, counted].mean()
 
 
 # fused: CPU, float32 ----------------------------------------------------------------------------------------

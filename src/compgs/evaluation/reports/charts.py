@@ -20,7 +20,7 @@ PALETTE = (
 )
 MARKERS = ("circle", "square", "triangle", "diamond")
 WIDTH, HEIGHT = 480, 320  # units of the drawing
-LEFT, RIGHT, TOP, BOTTOM = 62, 14, 12, 46  # margins
+LEFT, RIGHT, TOP, BOTTOM = 72, 14, 12, 46  # margins
 TICKS = 6  # about as many on an axis
 MARGIN = 0.06  # of an axis' length, beside the outermost points
 

@@ -76,6 +76,7 @@ def urls_within(images: Sequence[np.ndarray], width: int, most_bytes: int) -> li
 
     Reduced to `width` pixels first; below LEAST_WIDTH they are not reduced further, whatever it takes.
     """
+    width = min(width, max((image.shape[1] for image in images), default=width))
     for _ in range(ROUNDS):
         encoded = [webp(image, width) for image in images]
         needed = BASE64 * sum(map(len, encoded))

@@ -18,7 +18,7 @@ from compgs.evaluation.reports.pictures import (
 )
 from compgs.evaluation.reports.summary import Point
 
-PICTURE_BYTES = 6_000_000  # of all pictures in the page, at most
+PICTURE_BYTES = 4_000_000  # of all pictures in the page, at most
 WIDTH = 480  # pixels of a picture, at most
 SHOWN_VIEWS = 4  # of a scene, the worst
 SHOWN_RUNS = 6  # of a scene, in its pictures

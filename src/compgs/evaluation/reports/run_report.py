@@ -15,6 +15,9 @@ from compgs.outputs import check_output_file, write_bytes
 SHOWN_CURVES = 12  # of trainings in one chart
 SHOWN_COMPONENTS = 9  # each with a color; the others are one
 OTHER = "other"
+OPEN_ROWS = 40  # of the table of results; a longer one opens with a click
+MOST_ROWS = 1000  # of a table in the page
+OVERVIEW = ("means", "results", "bd_rates")  # tables that stand at the top
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ def report(
     title: str = "Report",
     reference: str | None = None,
     views: int = SHOWN_VIEWS,
+    others: Sequence[Table] = (),
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Report:
@@ -44,8 +48,9 @@ def report(
     `runs`: folders of trainings (`compgs train`) or evaluations (`compgs evaluate -o`), folders of such folders, or
     runs that are known already. Runs that differ in their seeds only are averaged; those that differ in their rate
     only form a curve. `output`: name of the page, ends in `.html`. `reference`: method that BD-rates are taken beside;
-    by default the first that has a curve. `views`: how many of each scene are shown, the worst. `progress(done,
-    total)` counts the scenes whose pictures are read.
+    by default the first that has a curve. `views`: how many of each scene are shown, the worst. `others`: further
+    tables, such as published results, that stand behind those of the runs. `progress(done, total)` counts the scenes
+    whose pictures are read.
 
     Raises ReportError if there is nothing to report on, ConfigError for an unknown reference, OutputError.
     """
@@ -57,13 +62,13 @@ def report(
     folders = [each for each in given if not isinstance(each, Run)]
     read, notes = read_runs(folders) if folders or not known else ([], ())
     points = summary.points_of([*known, *read])
-    made = tables_of(points, reference)
+    made = [*tables_of(points, reference), *others]
     contents = {file: data for file, data in written_tables(path, made).items()}
     for file in (path, *contents):
         check_output_file(file, overwrite=overwrite)
     figures, more = pictures_of(points, views, progress)
     body = "".join(
-        [*_overview(points, made), *_training(points), *figures, *_appendix(made, (*notes, *more))]
+        [*_overview(points, made), *_training(points), *figures, *_appendix(made, (*notes, *more), path.stem)]
     )
     for file, data in {**contents, path: page.page(title, body)}.items():
         write_bytes(file, data)
@@ -74,9 +79,10 @@ def report(
 
 
 def tables_of(points: Sequence[Point], reference: str | None = None) -> list[Table]:
-    """Results, BD-rates, components, views: those that there is something to say in. Raises ConfigError."""
+    """Means, results, BD-rates, components, views: those that there is something to say in. Raises ConfigError."""
     chosen = reference or _first_curve(points)
     found = [
+        summary.means_table(points),
         summary.results_table(points),
         summary.bd_rate_table(points, chosen) if chosen else None,
         summary.components_table(points),
@@ -106,7 +112,12 @@ def _first_curve(points: Sequence[Point]) -> str | None:
 def _overview(points: Sequence[Point], made: Sequence[Table]) -> list[str]:
     """Results, curves and BD-rates, components."""
     by_key = {table.key: table for table in made}
-    parts = [page.heading("Results"), tables.to_html(by_key["results"]), page.heading("Quality over bytes")]
+    parts = [page.heading("Results")]
+    if "means" in by_key:
+        parts += [page.heading(by_key["means"].title, 3), tables.to_html(by_key["means"])]
+    results = tables.to_html(by_key["results"])
+    parts += [page.folded("Every scene", results) if len(points) > OPEN_ROWS else results]
+    parts.append(page.heading("Quality over bytes"))
     for scene in summary.scenes(points):
         parts += _curves(scene, [point for point in points if point.scene == scene], summary.methods(points))
     if "bd_rates" in by_key:
@@ -206,14 +217,19 @@ def _training_series(style: int, point: Point, run: Run, measure: str) -> charts
     return charts.Series(f"{point.method} {point.rate}".strip(), known, style, marked=False)
 
 
-def _appendix(made: Sequence[Table], notes: Sequence[str]) -> list[str]:
+def _appendix(made: Sequence[Table], notes: Sequence[str], name: str) -> list[str]:
+    """Tables of details, those of others, and what is left out. `name`: of the page, without its ending."""
     parts = [page.heading("In numbers")]
     for table in made:
-        if table.key in ("components", "views"):
+        if table.key in OVERVIEW:
+            continue
+        if len(table.rows) > MOST_ROWS:
+            parts.append(
+                page.paragraph(f"{table.title}: {len(table.rows):,} rows, in {name}_{table.key}.csv.")
+            )
+        else:
             parts.append(page.folded(table.title, tables.to_html(table)))
     if notes:
-        parts += [
-            page.heading("Notes: what is left out"),
-            *(page.paragraph(f"{note}.", "note") for note in notes),
-        ]
+        parts.append(page.heading("Notes: what is left out"))
+        parts += [page.paragraph(f"{note}.", "note") for note in notes]
     return parts

@@ -11,14 +11,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from compgs.config import PRESETS, Config
 from compgs.errors import ReportError
 
 RESULTS_NAME = "results.json"
 SCHEMA = "compgs results 1"
 NEEDED = ("scene", "psnr", "ssim", "bytes", "components", "width", "height")  # of results.json
-# Settings by which runs of one method differ without being of another kind.
+# Settings of which a run's rate and seed are known already.
 RATE_SETTINGS = ("training.lmbda", "training.target_bytes")
 SEED_SETTING = "training.seed"
+OURS = "compgs"  # method whose presets are different curves; those that other methods have of their own are rates
+SHARED_SECTIONS = tuple(
+    Config().to_dict()
+)  # of the settings; a method's own section holds what sets its rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +83,7 @@ class _Found:
     """A run, and what tells it from others."""
 
     run: Run
+    kind: tuple[str, str]  # method and preset
     settings: dict[str, Any]  # `section.key`, of config.json
 
 
@@ -129,7 +135,7 @@ def _read(folder: Path) -> _Found:
         folder=folder,
         missing=tuple(name for name, is_lacking in lacks.items() if is_lacking),
     )
-    return _Found(run, settings)
+    return _Found(run, (str(config.get("method", OURS)), str(config.get("preset", ""))), settings)
 
 
 def _json(path: Path, kind: type) -> Any:
@@ -155,22 +161,25 @@ def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _method(config: Mapping[str, Any], folder: Path) -> str:
-    """`compgs default`, `3dgs`; without settings the name of the folder."""
+    """`compgs default`, `3dgs`, `3dgs quick`; without settings the name of the folder."""
     if not config:
         return folder.resolve().name
-    method, preset = str(config.get("method", "compgs")), str(config.get("preset", "default"))
-    return method if method != "compgs" and preset == "default" else f"{method} {preset}"
+    method, preset = str(config.get("method", OURS)), str(config.get("preset", "default"))
+    shared = preset in PRESETS and preset != "default"
+    return f"{method} {preset}" if method == OURS or shared else method
 
 
 def _rate(config: Mapping[str, Any], settings: Mapping[str, Any], training: Mapping[str, Any]) -> str:
-    """Of a method that weighs one: lambda, or the size that was asked for."""
-    if config.get("method", "compgs") != "compgs" and "lmbda" not in training:
-        return ""
-    target = settings.get("training.target_bytes")
-    if target is not None:
-        return f"{target:,} bytes asked"
-    lmbda = settings.get("training.lmbda")
-    return "" if lmbda is None else f"lambda {lmbda:g}"
+    """Of ours lambda, or the size that was asked for; of others the preset of their own, and lambda if they have it."""
+    own = config.get("method", OURS) != OURS
+    preset = config.get("preset", "default")
+    parts = [str(preset)] if own and preset not in PRESETS else []
+    target, lmbda = settings.get(RATE_SETTINGS[1]), settings.get(RATE_SETTINGS[0])
+    if target is not None and not own:
+        parts.append(f"{target:,} bytes asked")
+    elif lmbda is not None and (not own or "lmbda" in training):
+        parts.append(f"lambda {lmbda:g}")
+    return ", ".join(parts)
 
 
 def _named_apart(found: Sequence[_Found]) -> list[Run]:
@@ -185,22 +194,29 @@ def _named_apart(found: Sequence[_Found]) -> list[Run]:
         else each
         for each in found
     ]
-    return [replace(each.run, method=each.run.method + _differing(each, scened)) for each in scened]
+    named = []
+    for each in scened:
+        differing = _differing(each, scened)
+        own = [part for part in differing if part.partition(".")[0] not in SHARED_SECTIONS]
+        method = ", ".join([each.run.method, *(part for part in differing if part not in own)])
+        rate = ", ".join([*([each.run.rate] if each.run.rate else []), *own])
+        named.append(replace(each.run, method=method, rate=rate))
+    return named
 
 
 def _size(run: Run) -> tuple[int, int]:
     return run.results["width"], run.results["height"]
 
 
-def _differing(one: _Found, found: Sequence[_Found]) -> str:
-    """`, training.steps=500`, of a setting in which runs of one method on any scene differ; rate and seed aside."""
-    peers = [each.settings for each in found if each.run.method == one.run.method]
-    parts = []
-    for key, value in one.settings.items():
-        known = [settings[key] for settings in peers if key in settings]
-        if key not in (*RATE_SETTINGS, SEED_SETTING) and any(other != value for other in known):
-            parts.append(f", {key}={value}")
-    return "".join(parts)
+def _differing(one: _Found, found: Sequence[_Found]) -> list[str]:
+    """`training.steps=500`: settings in which runs of one method and preset differ, on any scene; not rate and seed."""
+    peers = [each.settings for each in found if each.kind == one.kind]
+    return [
+        f"{key}={value}"
+        for key, value in one.settings.items()
+        if key not in (*RATE_SETTINGS, SEED_SETTING)
+        and any(settings.get(key, value) != value for settings in peers)
+    ]
 
 
 def _lacks(runs: Sequence[Run]) -> list[str]:

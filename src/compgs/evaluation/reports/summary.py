@@ -11,6 +11,8 @@ from compgs.evaluation.reports.runs import Run
 from compgs.evaluation.reports.tables import Column, Spread, Table, Value
 
 PLAIN_3DGS = "3dgs"  # method that sizes are compared with
+# Numbers that seeds change; of the others the mean says enough.
+WITH_SPREAD = ("psnr", "ssim", "lpips", "bytes")
 ALL_SCENES = "mean of all scenes"
 MEASURES = (("psnr", "PSNR", ".2f"), ("ssim", "SSIM", ".4f"))
 
@@ -88,15 +90,29 @@ def methods(of: Sequence[Run] | Sequence[Point]) -> list[str]:
     return list(dict.fromkeys(each.method for each in of))
 
 
+def means_table(points: Sequence[Point]) -> Table | None:
+    """Means over all scenes, of each method and rate that has them all; None of a single scene."""
+    count = len(scenes(points))
+    groups: dict[tuple[str, str], list[Point]] = {}
+    for point in points:
+        groups.setdefault((point.method, point.rate), []).append(point)
+    rows = []
+    for (method, rate), group in groups.items():
+        if len(group) == count > 1:
+            numbers = [_row(point, points)[len(NAMES) :] for point in group]
+            # Without the scatter over seeds, which is not that over scenes.
+            rows.append((method, rate or None, *map(_mean, zip(*numbers, strict=True))))
+    columns = (*NAMES[1:], *NUMBERS)
+    title = f"Means of {count} scenes"
+    return Table("means", title, columns, tuple(rows)).without_empty_columns() if rows else None
+
+
 def results_table(points: Sequence[Point]) -> Table:
-    """A row for each point; of several scenes, means over all of them for each method and rate that has them all."""
-    rows = [_row(point, points) for point in points]
-    if len(scenes(points)) > 1:
-        rows += _mean_rows(rows, len(scenes(points)))
+    """A row for each point."""
+    rows = tuple(_row(point, points) for point in points)
     several = any(len(point.runs) > 1 for point in points)
     notes = ("± is the standard deviation over the seeds.",) if several else ()
-    columns = (*NAMES, *NUMBERS)
-    return Table("results", "Results", columns, tuple(rows), notes).without_empty_columns()
+    return Table("results", "Results", (*NAMES, *NUMBERS), rows, notes).without_empty_columns()
 
 
 def _row(point: Point, points: Sequence[Point]) -> tuple[Value, ...]:
@@ -104,20 +120,10 @@ def _row(point: Point, points: Sequence[Point]) -> tuple[Value, ...]:
     size = point.mean("bytes")
     ratio = plain[-1] / size if plain and plain[-1] and size else None
     known: dict[str, Value] = {"seeds": len(point.runs), "ratio": ratio}
-    numbers = [known[c.key] if c.key in known else point.spread(c.key) for c in NUMBERS]
+    for key in (column.key for column in NUMBERS if column.key not in known):
+        known[key] = point.spread(key) if key in WITH_SPREAD else point.mean(key)
+    numbers = [known[column.key] for column in NUMBERS]
     return (point.scene, point.method, point.rate or None, *numbers)
-
-
-def _mean_rows(rows: Sequence[tuple[Value, ...]], count: int) -> list[tuple[Value, ...]]:
-    """Without the scatter over seeds, which is not that over scenes."""
-    groups: dict[tuple[Value, ...], list[tuple[Value, ...]]] = {}
-    for row in rows:
-        groups.setdefault(row[1:3], []).append(row)
-    return [
-        (ALL_SCENES, *name, *(_mean([row[i] for row in group]) for i in range(len(NAMES), len(rows[0]))))
-        for name, group in groups.items()
-        if len(group) == count
-    ]
 
 
 def _mean(values: Sequence[Value]) -> float | None:
