@@ -14,6 +14,7 @@ Names are resolved on first use, so that `import compgs` is instant and decoding
 
 import importlib
 import os
+import time
 from typing import TYPE_CHECKING
 
 # torch's OpenMP threads spin between parallel regions and take the cores from numba's: a training step
@@ -22,13 +23,18 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
 
+# Seconds since the epoch when the first source of the package was read: what changes later may not be what is loaded.
+started = time.time()
+
 _HOME = {
     "load_scene": "compgs.scene",
-    "train": "compgs.training",
+    "train": "compgs.methods",
     "encode": "compgs.codec",
     "decode": "compgs.codec",
     "render": "compgs.render",
     "evaluate": "compgs.evaluation",
+    "compare": "compgs.evaluation",
+    "report": "compgs.evaluation.reports",
     "export": "compgs.exporting",
     "open_scene": "compgs.formats",
     "load_config": "compgs.config",
@@ -42,6 +48,7 @@ __all__ = [
     "CompGSError",
     "Gaussians",
     "__version__",
+    "compare",
     "decode",
     "encode",
     "evaluate",
@@ -50,6 +57,7 @@ __all__ = [
     "load_scene",
     "open_scene",
     "render",
+    "report",
     "train",
 ]
 
@@ -58,16 +66,20 @@ if TYPE_CHECKING:
     from compgs.codec import decode, encode
     from compgs.config import load_config
     from compgs.errors import CompGSError
+    from compgs.evaluation import compare as compare
     from compgs.evaluation import evaluate as evaluate
+    from compgs.evaluation.reports import report as report
     from compgs.exporting import export
     from compgs.formats import open_scene
     from compgs.gaussians import Gaussians
+    from compgs.methods import train
     from compgs.render import render
     from compgs.scene import load_scene
-    from compgs.training import train
 
 
 def __getattr__(name: str) -> object:
+    if name == "methods":
+        return importlib.import_module("compgs.methods")
     if name not in _HOME:
         raise AttributeError(f"module 'compgs' has no attribute {name!r}")
     return getattr(importlib.import_module(_HOME[name]), name)

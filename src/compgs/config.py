@@ -196,6 +196,9 @@ class TrainingConfig:
     appearance_dtype: Literal["float32", "bfloat16"] = "float32"
     # of the steps before the likelihood sees symbols in place of noise (soft then hard)
     hard_rate: Share = 0.8
+    # an affine change of color for each training view, for photographs of differing exposure or white balance: learned
+    # beside the scene, and kept out of the file (`training/exposures.py`)
+    exposure: bool = False
     # of the primitives, that a step does without, where training views are few
     left_out: Annotated[float, Range(0, 0.5)] = 0.2
     # cameras of training views that the file keeps, to look from; 0: none
@@ -271,23 +274,25 @@ def _section(kind: type, values: dict[str, Any], place: str) -> Any:
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
-def config_from_dict(values: dict[str, Any], place: str = "settings") -> Config:
-    """Inverse of `Config.to_dict`. Raises ConfigError on unknown names or values out of range."""
-    hints = typing.get_type_hints(Config)
+def config_from_dict(values: dict[str, Any], place: str = "settings", kind: type[Config] = Config) -> Config:
+    """Inverse of `Config.to_dict`, of a Config that may have more sections. Raises ConfigError on unknown names or
+    values out of range.
+    """
+    hints = typing.get_type_hints(kind)
     unknown = sorted(set(values) - set(hints))
     if unknown:
         raise ConfigError(f"{place}: unknown section {unknown[0]!r}; known: {', '.join(hints)}")
-    config = Config(**{k: _section(hints[k], v, f"{place}: [{k}]") for k, v in values.items()})
+    config = kind(**{k: _section(hints[k], v, f"{place}: [{k}]") for k, v in values.items()})
     check_config(config)
     return config
 
 
-def load_config(preset: str = "default") -> Config:
+def load_config(preset: str = "default", kind: type[Config] = Config) -> Config:
     """The settings of a preset: `default`, `paper` or `quick`. Raises ConfigError for any other name."""
     if preset not in PRESETS:
         raise ConfigError(f"preset {preset!r} does not exist; there are {', '.join(PRESETS)}")
     file = resources.files("compgs.presets") / f"{preset}.toml"
-    return config_from_dict(tomllib.loads(file.read_text(encoding="utf-8")), f"preset {preset}")
+    return config_from_dict(tomllib.loads(file.read_text(encoding="utf-8")), f"preset {preset}", kind)
 
 
 def check_config(config: Config) -> None:

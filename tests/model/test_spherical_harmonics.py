@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.special import lpmv
 
-from compgs.model.spherical_harmonics import (
+from compgs.tensors.spherical_harmonics import (
     coefficients,
     dc_from_color,
     harmonic_basis,

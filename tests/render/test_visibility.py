@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.render import RasterSettings, rasterize, visible_mask
+from compgs.render import RasterSettings, rasterize
+from compgs.render import visible_mask as visible_mask_of_arrays
+from compgs.tensors.visibility import visible_mask
 
 SETTINGS = RasterSettings()
 CUTOFF_SIGMAS = np.sqrt(2 * np.log(255))
@@ -35,7 +37,7 @@ def test_whatever_touches_a_pixel_is_visible(seed):
     scales = np.exp(r.normal(-2, 1.5, (n, 3)))
     means = r.normal(0, 1.5, (n, 3))
     fields = (means, r.normal(size=(n, 4)), scales, np.ones(n), np.ones((n, 3)))
-    drawn = rasterize(Gaussians(*(torch.tensor(f, dtype=torch.float32) for f in fields)), camera).visible
+    drawn = rasterize(Gaussians(*(f.astype(np.float32) for f in fields)), camera).visible
 
     # Anchors some way off their Gaussian, with radii that reach to where it ends
     offsets = r.normal(0, 0.3, (n, 3))
@@ -52,6 +54,8 @@ def test_the_compiled_test_is_the_plain_one():
     positions, radii = torch.tensor(r.normal(0, 3, (20_000, 3))), torch.tensor(r.uniform(0, 0.3, 20_000))
     plain = visible_mask(positions, radii, camera, SETTINGS)
     compiled = visible_mask(positions.float(), radii.float(), camera, SETTINGS)
+    arrays = positions.float().numpy(), radii.float().numpy()
+    assert np.array_equal(compiled, visible_mask_of_arrays(*arrays, camera, SETTINGS))
     assert torch.sum(plain != compiled) <= 2  # rounding, exactly on the boundary
     assert 0 < plain.sum() < len(plain)
 

@@ -44,14 +44,14 @@ def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
 
 def test_photographs_without_poses_are_refused_with_the_command_that_helps(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
-    with pytest.raises(MissingSparseModel, match=r"no camera poses.*colmap automatic_reconstructor"):
+    with pytest.raises(MissingSparseModel, match=r"no camera poses.*compgs reconstruct"):
         load_scene(tmp_path)
 
 
 def test_the_command_that_helps_quotes_folders_with_spaces(tmp_path: Path) -> None:
     folder = tmp_path / "my garden"
     (folder / "images").mkdir(parents=True)
-    with pytest.raises(MissingSparseModel, match=r"--workspace_path '.*my garden' --image_path"):
+    with pytest.raises(MissingSparseModel, match=r"compgs reconstruct '.*my garden' -o SCENE"):
         load_scene(folder)
 
 
@@ -231,4 +231,15 @@ def test_usual_formats_are_read(tmp_path: Path, suffix: str) -> None:
     file = tmp_path / f"a.{suffix}"
     Image.new("RGB", (24, 16), (200, 100, 50)).save(file)
     assert image_size(file) == (24, 16)
-    assert np.abs(read_image(file, (0.0, 0.0, 0.0)).mean((0, 1)) - (200, 100, 50)).max() < 4
+    assert np.abs(read_image(file, None)[0].mean((0, 1)) - (200, 100, 50)).max() < 4
+
+
+@pytest.mark.parametrize("name", ["a.heic", "a.jpg"])
+def test_heic_is_named_with_its_remedy(tmp_path: Path, name: str) -> None:
+    file = tmp_path / name
+    file.write_bytes(b"\x00\x00\x00\x24ftypheic" + bytes(40))
+    for reading in (image_size, lambda file: read_image(file, None)):
+        with pytest.raises(
+            UnreadableImage, match=rf"{name}: HEIC images are not read; convert all of them to JPEG"
+        ):
+            reading(file)

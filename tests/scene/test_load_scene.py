@@ -173,15 +173,16 @@ def test_zero_distortion_leaves_pixels_untouched(write_capture: Write) -> None:
         assert one.camera.cx == other.camera.cx
 
 
-def test_transparent_images_stand_on_the_background(write_capture: Write) -> None:
+def test_transparent_images_stand_on_a_background_that_is_given(write_capture: Write) -> None:
     folder = write_capture()
     rgba = np.zeros((16, 24, 4), dtype=np.uint8)
     rgba[..., 0], rgba[..., 3] = 200, np.arange(24) * 11
     Image.fromarray(rgba).save(folder / "images" / "01.png")
     alpha = np.arange(24) * 11 / 255
-    for background in (None, (0.0, 0.5, 1.0)):
+    for background in ((0.0, 0.0, 0.0), (0.0, 0.5, 1.0)):
         view = by_name(load_scene(folder, background=background).train_views)["01.png"]
-        behind = np.array(background or (0.0, 0.0, 0.0)) * 255
+        assert view.mask is None
+        behind = np.array(background) * 255
         expected = alpha[:, None] * (200, 0, 0) + (1 - alpha[:, None]) * behind
         assert np.abs(view.image - expected[None]).max() <= 0.5001
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from compgs.errors import CompGSError, SceneError, UnreadableImage, UnsupportedCamera
-from compgs.scene import load_scene
+from compgs.scene import images, load_scene
 from compgs.scene.nerfstudio import read_nerfstudio
 from compgs.scene.ply_points import read_ply_points
 from compgs.scene.undistort import distort
@@ -246,3 +246,25 @@ def test_scaled_poses_keep_their_position(nerfstudio: Callable[..., Path]) -> No
         frame["transform_matrix"] = matrix.tolist()
     (folder / "transforms.json").write_text(json.dumps(content))
     assert_looks_at_origin(load_scene(folder).train_views)
+
+
+@pytest.mark.parametrize("layout", ["blender", "nerfstudio"])
+@pytest.mark.parametrize("name", ["../elsewhere.png", "/elsewhere.png", "images/../../elsewhere.png"])
+def test_images_outside_of_the_scene_are_refused_before_they_are_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str, name: str
+) -> None:
+    folder = tmp_path / "scene"
+    entries = frames(folder, "images", 3, ".png")
+    entries[1]["file_path"] = name
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "elsewhere.png")
+    file = {"blender": "transforms_train.json", "nerfstudio": "transforms.json"}[layout]
+    (folder / file).write_text(json.dumps({"camera_angle_x": 0.7, "frames": entries}))
+    opened: list[str] = []
+    monkeypatch.setattr(images, "image_size", lambda path: opened.append(str(path)) or (WIDTH, HEIGHT))
+    for module in ("blender", "nerfstudio"):
+        monkeypatch.setattr(f"compgs.scene.{module}.image_size", images.image_size)
+    with pytest.raises(
+        SceneError, match=r"scene: the image of frame 1 in .* lies outside of the scene's folder"
+    ):
+        load_scene(folder)
+    assert not [path for path in opened if "elsewhere" in path]

@@ -27,7 +27,7 @@ def test_a_run_stopped_anywhere_continues_exactly(blob_scene, tiny_config, tmp_p
         for _ in range(stop):
             first.train_step()
         first.save(path)
-        second = Trainer.resumed(blob_scene, load_checkpoint(path), tiny_config, CPU)
+        second = Trainer.resumed(blob_scene, path, tiny_config, CPU)
         assert second.step == stop
         second.run(None, None)
         assert same(whole.model, second.model), f"stopped at step {stop}"
@@ -67,7 +67,7 @@ def test_other_settings_are_refused_by_name(blob_scene, tiny_config, tmp_path):
     trainer.save(path)
     other = replace(tiny_config, training=replace(tiny_config.training, lmbda=0.5))
     with pytest.raises(CheckpointError, match="lmbda"):
-        Trainer.resumed(blob_scene, load_checkpoint(path), other, CPU)
+        Trainer.resumed(blob_scene, path, other, CPU)
 
 
 def test_missing_and_damaged_checkpoints_are_named(tmp_path):
@@ -180,7 +180,7 @@ def test_a_continued_run_keeps_what_it_did_when_it_is_stopped_again(blob_scene, 
     with pytest.raises(KeyboardInterrupt):
         Trainer(blob_scene, tiny_config, CPU).run(path, stopped_at_10)
     with pytest.raises(KeyboardInterrupt):
-        Trainer.resumed(blob_scene, load_checkpoint(path), tiny_config, CPU).run(path, stopped_at_10)
+        Trainer.resumed(blob_scene, path, tiny_config, CPU).run(path, stopped_at_10)
     assert load_checkpoint(path).state["step"] == 20
 
 

@@ -8,7 +8,7 @@ import torch
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig, load_config
 from compgs.gaussians import Gaussians
-from compgs.model.prediction import Prediction
+from compgs.tensors.prediction import Prediction
 from compgs.trained_model import TrainedModel
 from compgs.training import target_size
 from compgs.training.control import AdaptiveControl, ControlSchedule, make_schedule, new_cells, rate_weight

@@ -7,8 +7,8 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.config import SplatConfig
-from compgs.model.splats import Splats
-from compgs.render.reference import rotation_matrices
+from compgs.tensors.reference import rotation_matrices
+from compgs.tensors.splats import Splats
 from compgs.training.densification import (
     SPLIT_SHRINK,
     DensityControl,
@@ -16,7 +16,12 @@ from compgs.training.densification import (
     rotate,
     split,
 )
-from compgs.training.splat_parameters import SplatParameters, make_splat_optimizer, reset_opacities
+from compgs.training.splat_parameters import (
+    SplatParameters,
+    make_splat_optimizer,
+    replace_splats,
+    reset_opacities,
+)
 
 CPU = torch.device("cpu")
 EXTENT = 4.0
@@ -53,7 +58,11 @@ def act(parameters, optimizer, gradient: list[float], config=None, *, remove_lar
     control = DensityControl(config or SplatConfig(), EXTENT, len(parameters), CPU)
     control.gradient[:] = torch.tensor(gradient) * 3
     control.seen[:] = 3
-    control.act(parameters, optimizer, torch.Generator().manual_seed(0), remove_large=remove_large)
+    splats, chance = parameters.trained(), torch.Generator().manual_seed(0)
+    kept, added, origins = control.chosen(splats, splats, chance, remove_large=remove_large)
+    assert torch.equal(added.dc, splats.dc[origins])
+    replace_splats(parameters, optimizer, kept, added)
+    control.forget(len(parameters))
     assert len(control.gradient) == len(control.seen) == len(parameters)
     assert not control.gradient.any() and not control.seen.any()
 

@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from compgs.config import Config
-from compgs.render import rasterize, render
+from compgs.gaussians import Gaussians
+from compgs.render import render
 from compgs.scene.views import Scene, View
+from compgs.tensors.rasterize import rasterize
 from compgs.training.rate_control import RateState
 from compgs.training.target_size import pruned_share
 from compgs.training.trainer import Trainer
@@ -43,14 +45,15 @@ def least_first(contributions: np.ndarray, share: float) -> np.ndarray:
 def by_color(trainer: Trainer, views: Sequence[View]) -> np.ndarray:
     """[N, K] contributions of all primitives: how much brighter the images get with the primitive's color."""
     model = trainer.model.as_hybrid_model()
-    total = torch.zeros(model.coupled)
+    total = np.zeros(model.coupled, np.float32)
     for view in views:
-        drawn, index = model.drawn(view.camera)
+        arrays, index = model.drawn(view.camera)
+        drawn = Gaussians(*(torch.from_numpy(array) for array in vars(arrays).values()))
         red = drawn.colors[:, :1].clone().requires_grad_()
         image = rasterize(replace(drawn, colors=red.expand(-1, 3)), view.camera).image
         image[..., 0].sum().backward()
-        total[index] += red.grad[:, 0]
-    return total.view(trainer.model.anchors, -1).numpy()
+        total[index] += red.grad[:, 0].numpy()
+    return total.reshape(trainer.model.anchors, -1)
 
 
 @pytest.fixture
@@ -162,7 +165,7 @@ def test_pruning_that_falls_on_a_view_of_nothing_happens_all_the_same(
     lost = replace(view, camera=replace(view.camera, world_to_camera=aside))
     config = with_pruning(tiny_config, 0.1, (0.0,))
     trainer = Trainer(replace(blob_scene, train_views=(lost, *blob_scene.train_views[1:])), config, CPU)
-    trainer.order = [0]  # the first view
+    trainer.views.order = [0]  # the first view
     anchors = trainer.model.anchors
     trainer.train_step()
     assert trainer.model.anchors < anchors

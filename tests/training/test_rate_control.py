@@ -8,7 +8,6 @@ import torch
 
 from compgs.codec import encode
 from compgs.errors import ConfigError
-from compgs.training.checkpoint import load_checkpoint
 from compgs.training.control import make_schedule
 from compgs.training.file_size import latent_bytes
 from compgs.training.initial import initial_model
@@ -125,9 +124,7 @@ def test_a_run_that_seeks_a_size_continues_exactly_and_needs_no_display(blob_sce
         for _ in range(stop):
             first.train_step()
         first.save(tmp_path / "checkpoint.safetensors")
-        second = Trainer.resumed(
-            blob_scene, load_checkpoint(tmp_path / "checkpoint.safetensors"), config, CPU
-        )
+        second = Trainer.resumed(blob_scene, tmp_path / "checkpoint.safetensors", config, CPU)
         second.run(None, None)
         assert second.rate == whole.rate != RateState(config.training.lmbda)
         for name, value in second.model.state_dict().items():

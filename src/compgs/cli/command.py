@@ -1,14 +1,17 @@
 """What all commands have in common."""
 
+import dataclasses
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.run_folder import SceneSource
 from compgs.cli.usage import UsageError, check_range, settings_of_options
 from compgs.errors import ConfigError
+from compgs.extras import require
 
 NO_DEFAULT = ""  # instead of "(default: None)" in the help
 
@@ -42,6 +45,29 @@ class ComputingCommand(Command):
         if self.device is not None:
             check_device(self.device)
 
+    def prepare_training(self) -> None:
+        """`prepare`, for what trained models need. Raises MissingDependency without torch, too."""
+        require("train", "training")
+        self.prepare()
+        if self.threads is not None:
+            import torch
+
+            torch.set_num_threads(self.threads)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecodingCommand(ComputingCommand):
+    """A command that decodes a file."""
+
+    tmc3: FlagCreatePairsOff[bool] = False
+    """Let the program tmc3 from PATH decode anchor positions that a file has by G-PCC."""
+
+    def prepare(self) -> None:
+        """Apply `threads` and `tmc3`, check `device`. Raises UsageError, ConfigError."""
+        super().prepare()
+        if self.tmc3:
+            allow_tmc3()
+
 
 @dataclass(frozen=True, kw_only=True)
 class FileArgument:
@@ -57,6 +83,15 @@ class SceneFileArgument:
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """A .cgs file, or splats: .ply as 3DGS writes it, .spz, .sog (or its meta.json), .glb, .splat."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFileOrRunArgument:
+    """Which file; one that a run has left brings its scene along."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE|RUN")]
+    """A .cgs file, or splats: .ply as 3DGS writes it, .spz, .sog (or its meta.json), .glb, .splat; or the folder of a
+    run, for its file, and its scene read as in training."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +141,17 @@ class SceneOptions(ReadingOptions):
         """Raises UsageError if not exactly one scene was given."""
         return self.source_at(one_scene(self.scene, self.source), holdout=holdout)
 
+    def source_of_run(self, begun: SceneSource) -> SceneSource:
+        """As a run read its scene; what is given here goes before that. Raises UsageError."""
+        self.check_reading()
+        options = {field.name: field.default for field in dataclasses.fields(ReadingOptions)}
+        given: dict[str, Any] = {
+            name: getattr(self, name) for name in options if getattr(self, name) != options[name]
+        }
+        if self.scene or self.source:
+            given["path"] = str(one_scene(self.scene, self.source))
+        return dataclasses.replace(begun, **given)
+
 
 def one_scene(scene: Path | None, source: Path | None) -> Path:
     """SCENE or --source, whichever was given. Raises UsageError for none or two."""
@@ -118,14 +164,19 @@ def one_scene(scene: Path | None, source: Path | None) -> Path:
 
 
 def use_threads(count: int) -> None:
-    """Of numba and torch. Raises UsageError."""
+    """Of numba. Raises UsageError."""
     import numba
-    import torch
 
     limit = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     check_range("--threads", count, 1, limit)
     numba.set_num_threads(count)
-    torch.set_num_threads(count)
+
+
+def allow_tmc3() -> None:
+    """From now on, in this process."""
+    from compgs.codec.tmc3 import ASKED_BY
+
+    os.environ[ASKED_BY] = "1"
 
 
 def check_lpips() -> None:
@@ -136,17 +187,11 @@ def check_lpips() -> None:
 
 
 def check_device(name: str) -> None:
-    """Raises UsageError for a device that PyTorch does not know or does not find."""
-    import torch
+    """Raises ConfigError for a device that is not known or not there, UsageError for what is no device."""
+    from compgs import devices
 
     try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise UsageError(f"--device {name}: expected cpu or cuda") from error
-    if device.type not in ("cpu", "cuda"):
-        raise UsageError(f"--device {name}: expected cpu or cuda")
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise ConfigError(
-            f"--device {name}: PyTorch finds {torch.cuda.device_count()} CUDA devices; "
-            "use --device cpu, or install a CUDA build of PyTorch"
-        )
+        devices.check_device(name)
+    except ConfigError as error:
+        kind = type(error) if name.startswith("cuda") else UsageError
+        raise kind(f"--{error}") from error

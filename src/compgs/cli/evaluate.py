@@ -6,21 +6,24 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument, SceneOptions, check_lpips
-from compgs.cli.console import print_results, say
+from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileOrRunArgument, SceneOptions, check_lpips
+from compgs.cli.console import print_results, say, warn
 from compgs.cli.progress import counting
+from compgs.cli.run_folder import file_and_run, read_otherwise
 from compgs.cli.scenes import read_scene
 from compgs.outputs import check_output_folder
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
+class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
     """Decode a file, render a scene's held-out views from it and compare them with the photographs.
 
     Give -r, --images, --test-every and --background as in training: the views held out there are the ones to
-    evaluate on.
+    evaluate on. A run's folder, or the file in it, needs none of that, and no scene.
 
     Examples
+
+    compgs evaluate runs/garden
 
     compgs evaluate garden.cgs scenes/garden
 
@@ -40,13 +43,21 @@ class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
     lpips: FlagCreatePairsOff[bool] = False
     """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
 
+    exposure: FlagCreatePairsOff[bool] = False
+    """Give each rendering the exposure of its photograph, fitted to the left half, and measure the right half; as for
+    runs that were trained with --set training.exposure=true."""
+
     def run(self) -> None:
         from compgs.formats import check_scene
 
-        check_scene(self.file)
+        file, run = file_and_run(self.file)
+        check_scene(file)
         if self.output is not None:
             check_output_folder(self.output, overwrite=self.overwrite)
-        source = self.scene_source()
+        whole = self.file.is_dir() or not (self.scene or self.source)
+        source = self.source_of_run(run.scene) if run and whole else self.scene_source()
+        if run and (otherwise := read_otherwise(run.scene, source)):
+            warn(f"{file} was trained with {otherwise}")
         self.prepare()
         if self.lpips:
             check_lpips()
@@ -55,12 +66,14 @@ class Evaluate(ComputingCommand, SceneOptions, SceneFileArgument):
         scene = read_scene(source)
         with counting("evaluating views") as progress:
             results = evaluate(
-                self.file,
+                file,
                 scene,
                 output=self.output,
                 overwrite=self.overwrite,
                 lpips=self.lpips,
                 device=self.device,
+                method=run.method if run else None,
+                exposure=self.exposure or (run is not None and run.config.training.exposure),
                 progress=progress,
             )
         say("")

@@ -12,7 +12,10 @@ from rich.table import Table
 
 from compgs import __version__
 from compgs.cli.arguments import command_name, parse_command
+from compgs.cli.benchmark import Benchmark
 from compgs.cli.command import Command
+from compgs.cli.compare import Compare
+from compgs.cli.compiling import say_when_compiling
 from compgs.cli.console import console, errors, show_whatever_can_be_shown
 from compgs.cli.decode import Decode
 from compgs.cli.demo_scene import DemoScene
@@ -20,19 +23,27 @@ from compgs.cli.encode import Encode
 from compgs.cli.evaluate import Evaluate
 from compgs.cli.export import Export
 from compgs.cli.info import Info
+from compgs.cli.reconstruct import Reconstruct
 from compgs.cli.render import Render
+from compgs.cli.report import Report
 from compgs.cli.serve import Serve
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError, in_words_of_options
+from compgs.cli.view import View
 from compgs.errors import CompGSError
 from compgs.interrupt import Terminated, ended_on_request, held_back
 
 COMMANDS: tuple[type[Command], ...] = (
+    Reconstruct,
     Train,
     Encode,
     Decode,
     Render,
     Evaluate,
+    View,
+    Compare,
+    Report,
+    Benchmark,
     Export,
     Serve,
     Info,
@@ -83,6 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(command: Command) -> int:
     """The exit code; unexpected exceptions, which are our mistakes, keep their traceback."""
+    say_when_compiling()
     try:
         with ended_on_request():
             command.run()

@@ -20,14 +20,13 @@ if TYPE_CHECKING:
 
 LINE_SECONDS = 15.0  # between two plain lines
 BAR_WIDTH = 12  # columns of the bar beside the words of a training
-COMPILING = "compiling; the first step takes longer than all others"
 
 
 @contextmanager
 def counting(what: str) -> Iterator[Callable[[int, int], None]]:
     """Yields `progress(done, total)`, for things that can be counted."""
     if not console.is_terminal:
-        yield _counting_lines(what)
+        yield counting_lines(what)
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as bars:
@@ -39,12 +38,11 @@ def counting(what: str) -> Iterator[Callable[[int, int], None]]:
 def training() -> Iterator[Callable[["TrainingStatus"], None]]:
     """Yields `on_progress(status)`: steps, time left, quality, size, and as much else as there is room for."""
     if not console.is_terminal:
-        say(f"training: {COMPILING}")
         yield _training_lines()
         return
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=BAR_WIDTH))
     with Progress(*columns, console=console) as bars:
-        task = bars.add_task(f"training: {COMPILING}", total=None)
+        task = bars.add_task("training: the first step", total=None)
 
         def show(status: "TrainingStatus") -> None:
             room = console.width - BAR_WIDTH - 1
@@ -84,7 +82,7 @@ def time_left(status: "TrainingStatus") -> str:
     return f"{duration(seconds) if seconds >= 60 else f'{seconds} s'} left"
 
 
-def _counting_lines(what: str) -> Callable[[int, int], None]:
+def counting_lines(what: str) -> Callable[[int, int], None]:
     last = time.monotonic()
 
     def show(done: int, total: int) -> None:

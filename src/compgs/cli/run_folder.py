@@ -1,6 +1,7 @@
 """A run's folder: what `compgs train` leaves there, and `config.json`, which says how it came about."""
 
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -8,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from compgs import __version__
-from compgs.cli.methods import METHODS
 from compgs.config import Config, config_from_dict
 from compgs.errors import CheckpointError, OutputError
+from compgs.methods import METHODS
 from compgs.outputs import write_json
 
 SETTINGS_NAME = "config.json"
@@ -38,6 +39,7 @@ class RunSettings:
     scene: SceneSource
     config: Config
     method: str = "compgs"
+    splats: str | None = None  # file of splats that the run began with
 
 
 def file_name(folder: Path, extension: str = ".cgs") -> str:
@@ -53,6 +55,7 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
         "preset": settings.preset,
         "scene": asdict(settings.scene),
         "settings": settings.config.to_dict(),
+        **({"from_splats": settings.splats} if settings.splats is not None else {}),
     }
     write_json(folder / SETTINGS_NAME, content)
 
@@ -116,7 +119,8 @@ def forget_results(folder: Path) -> None:
 def _made_by_runs(folder: Path) -> list[Path]:
     """The checkpoint, and what is made of it in the end."""
     names = [CHECKPOINT_NAME, TRAINING_NAME, "results.json", "per_view.json"]
-    return [folder / name for name in names + [file_name(folder, m.extension) for m in METHODS.values()]]
+    suffixes = sorted({method.suffix for method in METHODS.values()})
+    return [folder / name for name in names + [file_name(folder, suffix) for suffix in suffixes]]
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -133,11 +137,13 @@ def load_settings(folder: Path) -> RunSettings:
     path = folder / SETTINGS_NAME
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+        method = _known_method(content.get("method", "compgs"))
         return RunSettings(
             preset=str(content["preset"]),
             scene=_scene_source(content["scene"]),
-            config=config_from_dict(content["settings"], str(path)),
-            method=_known_method(content.get("method", "compgs")),
+            config=config_from_dict(content["settings"], str(path), METHODS[method].settings),
+            method=method,
+            splats=content.get("from_splats"),
         )
     except FileNotFoundError as error:
         if (folder / CHECKPOINT_NAME).is_file():
@@ -152,6 +158,51 @@ def load_settings(folder: Path) -> RunSettings:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path}: not the settings of a run ({error}); train anew") from error
+
+
+def file_and_run(path: Path) -> tuple[Path, RunSettings | None]:
+    """Of a run's folder, or of its file: the file, and the run's settings. Any other path stays as it is.
+
+    Raises CheckpointError for a folder of a run that has not written its file.
+    """
+    folder = path if path.is_dir() else path.parent
+    if not (folder / SETTINGS_NAME).is_file():
+        return path, None
+    if not path.is_dir():
+        with suppress(CheckpointError):
+            settings = load_settings(folder)
+            if path.name == _written_by(folder, settings).name:
+                return path, settings
+        return path, None
+    settings = load_settings(folder)
+    file = _written_by(folder, settings)
+    if not file.is_file():
+        command = f"compgs train -o {shlex.quote(str(folder))} --resume"
+        raise CheckpointError(
+            f"{folder}: the run has not written {file.name} yet; continue it with: {command}"
+        )
+    return file, settings
+
+
+def _written_by(folder: Path, settings: RunSettings) -> Path:
+    return folder / file_name(folder, METHODS[settings.method].suffix)
+
+
+def read_otherwise(begun: SceneSource, now: SceneSource) -> str:
+    """In what a scene is not read as when a run on it began, as options; empty if there is nothing."""
+    options = {"downscale": "-r", "test_every": "--test-every", "background": "--background"}
+    differing = [
+        f"{option} {_as_typed(getattr(begun, name))} (now {_as_typed(getattr(now, name))})"
+        for name, option in options.items()
+        if getattr(begun, name) != getattr(now, name)
+    ]
+    return ", ".join(differing + (["--no-eval"] if now.holdout and not begun.holdout else []))
+
+
+def _as_typed(value: Any) -> str:
+    if value is None:
+        return "not given"
+    return " ".join(f"{part:g}" for part in value) if isinstance(value, tuple) else str(value)
 
 
 def _known_method(name: str) -> str:

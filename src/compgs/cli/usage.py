@@ -15,7 +15,13 @@ OPTIONS = {
 
 
 # Messages of the package name arguments of Python functions; on the command line these options take their place.
-OF_PYTHON = {"overwrite=True": "--overwrite", "resume=True": "--resume", "images=...": "--images"}
+OF_PYTHON = {
+    "overwrite=True": "--overwrite",
+    "resume=True": "--resume",
+    "images=...": "--images",
+    "downscale=...": "-r",
+    "test_every=...": "--test-every",
+}
 
 
 class UsageError(ConfigError):

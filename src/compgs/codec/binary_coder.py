@@ -21,8 +21,9 @@ straddles a byte boundary for long costs nothing measurable.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from compgs.numerics.compiled import njit
 
 Int = int | np.int64  # of a numba kernel: always 64 bits
 
@@ -94,7 +95,7 @@ def make_states(count: int) -> NDArray[np.uint32]:
     return np.full(count, EVEN_STATE, np.uint32)
 
 
-@njit(cache=True)
+@njit
 def start_encoder(coder: NDArray[np.int64]) -> None:
     """coder: [5] int64."""
     coder[LOW] = 0
@@ -104,7 +105,7 @@ def start_encoder(coder: NDArray[np.int64]) -> None:
     coder[DECODING] = 0
 
 
-@njit(cache=True)
+@njit
 def start_decoder(coder: NDArray[np.int64], data: NDArray[np.uint8]) -> None:
     """Bytes beyond the end of the data read as 0."""
     start_encoder(coder)
@@ -114,7 +115,7 @@ def start_decoder(coder: NDArray[np.int64], data: NDArray[np.uint8]) -> None:
     coder[POSITION] = LOOKAHEAD
 
 
-@njit(cache=True)
+@njit
 def finish_encoder(coder: NDArray[np.int64], data: NDArray[np.uint8]) -> Int:
     """Number of bytes that the code takes; more than `len(data)`: the buffer was too short, encode again.
 
@@ -127,7 +128,7 @@ def finish_encoder(coder: NDArray[np.int64], data: NDArray[np.uint8]) -> Int:
     return position + 1
 
 
-@njit(cache=True)
+@njit
 def finish_decoder(coder: NDArray[np.int64]) -> Int:
     """Number of bytes that the code took; -1 if it does not end as `finish_encoder` ends it."""
     if coder[CODE] != ((coder[LOW] >> 40) + 1) << 40:
@@ -135,13 +136,13 @@ def finish_decoder(coder: NDArray[np.int64]) -> Int:
     return coder[POSITION] - LOOKAHEAD + 1
 
 
-@njit(cache=True)
+@njit
 def is_exhausted(coder: NDArray[np.int64], data: NDArray[np.uint8]) -> bool:
     """Whether the decoder has read further than any valid code of this length would."""
     return coder[POSITION] > len(data) + LOOKAHEAD
 
 
-@njit(cache=True)
+@njit
 def code_bit(coder: NDArray[np.int64], data: NDArray[np.uint8], p1: Int, bit: Int) -> Int:
     """One decision. 0 < p1 < 65536. Writes beyond the end of `data` are counted and dropped."""
     low = coder[LOW]
@@ -170,7 +171,7 @@ def code_bit(coder: NDArray[np.int64], data: NDArray[np.uint8], p1: Int, bit: In
     return bit
 
 
-@njit(cache=True)
+@njit
 def learn(states: NDArray[np.uint32], index: Int, bit: Int, limit: Int) -> None:
     """Move a state towards a decision, by RATE at first and by RATE[limit] in the end."""
     state = np.int64(states[index])
@@ -180,7 +181,7 @@ def learn(states: NDArray[np.uint32], index: Int, bit: Int, limit: Int) -> None:
     states[index] = np.uint32((p << COUNT_BITS) | (count + (1 if count < limit else 0)))
 
 
-@njit(cache=True)
+@njit
 def adaptive_bit(
     coder: NDArray[np.int64],
     data: NDArray[np.uint8],
@@ -196,7 +197,7 @@ def adaptive_bit(
     return bit
 
 
-@njit(cache=True)
+@njit
 def mixed_bit(
     coder: NDArray[np.int64],
     data: NDArray[np.uint8],

@@ -16,7 +16,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from compgs.numerics.compiled import njit
 
 FRACTION_BITS = 12
 ACTIVATION_LIMIT = 1 << 23  # activations are in [-2^23, 2^23 - 1]
@@ -164,13 +166,13 @@ def _matrix(layer: IntegerLayer) -> np.ndarray:
     return matrix
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _clamped(x):
     v = min(np.int64(x), ACTIVATION_LIMIT - 1)
     return max(v, -ACTIVATION_LIMIT)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _sums(x, weight, inputs, sums):
     """W x of one row. Four inputs at a time, so that each sum is loaded and stored once for four products."""
     for i in range(len(x)):
@@ -184,7 +186,7 @@ def _sums(x, weight, inputs, sums):
             )
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _activation(a, bias, half, scale, rectify):
     """Rounding shift, bias, leaky ReLU and clamp of an integer held in a float: floor(a / 2^s) is a >> s."""
     y = np.floor((a + half) * scale) + bias
@@ -193,7 +195,7 @@ def _activation(a, bias, half, scale, rectify):
     return min(max(y, -float(ACTIVATION_LIMIT)), float(ACTIVATION_LIMIT - 1))
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _layer(x, weight, bias, shift, rectify, added, out):
     """added [N, out] or [0, out]: nothing."""
     scale = 1.0 / (1 << shift)
@@ -210,7 +212,7 @@ def _layer(x, weight, bias, shift, rectify, added, out):
                 out[n, c] = np.int32(y)
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _parameters(x, weight, bias, shift, rectify, mask, rows, means, index):
     scale = 1.0 / (1 << shift)
     half = float(1 << (shift - 1)) if shift > 0 else 0.0

@@ -8,7 +8,6 @@ are one function, so that their contexts cannot drift apart.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from compgs.codec.binary_coder import (
@@ -25,6 +24,7 @@ from compgs.codec.binary_coder import (
     start_encoder,
 )
 from compgs.errors import CorruptSection, NotEncodable
+from compgs.numerics.compiled import njit
 
 __all__ = ["MAXIMUM_ANCHORS", "MAXIMUM_COUPLED", "decode_masks", "encode_masks"]
 
@@ -36,7 +36,7 @@ MIXING_RATE = 2  # in 2**-16
 INITIAL_WEIGHT = 3 * WEIGHT_ONE // 8
 
 
-@njit(cache=True)
+@njit
 def _walk(
     coder: NDArray[np.int64],
     data: NDArray[np.uint8],

@@ -19,7 +19,6 @@ import os
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from compgs.codec.anchor_order import (
@@ -48,6 +47,7 @@ from compgs.codec.binary_coder import (
 )
 from compgs.codec.fields import FieldReader, signed_varint
 from compgs.errors import CorruptSection, NotEncodable
+from compgs.numerics.compiled import njit
 
 __all__ = ["ANCHORS_PER_BYTE", "MAXIMUM_ANCHORS", "decode_positions", "encode_positions"]
 
@@ -108,7 +108,7 @@ _AXIS_BITS = np.array([0x4924924924924924, 0x2492492492492492, 0x124924924924924
 _AXIS_ONE = np.array([4, 2, 1], np.int64)
 
 
-@njit(cache=True)
+@njit
 def _moved(code: Int, axis: Int, forward: bool) -> Int:
     """Morton code one step along an axis. Below 0 it wraps to 2**21 - 1, where no block can be."""
     mask = _AXIS_BITS[axis]
@@ -117,7 +117,7 @@ def _moved(code: Int, axis: Int, forward: bool) -> Int:
     return (code & ~mask) | along
 
 
-@njit(cache=True)
+@njit
 def _ones(v: np.uint64) -> Int:
     """Number of set bits."""
     v = v - ((v >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -126,7 +126,7 @@ def _ones(v: np.uint64) -> Int:
     return np.int64((v * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@njit(cache=True)
+@njit
 def _cell_state(filled: np.uint64, unknown: np.uint64, cell: Int) -> Int:
     """0 empty, 1 occupied, 2 unknown."""
     at = np.uint64(cell)
@@ -150,7 +150,7 @@ class Level(NamedTuple):
     places: NDArray[np.int16]  # [8 N] what is where: place = 8 * block + child index
 
 
-@njit(cache=True)
+@njit
 def _slot(level: Level, mask: Int, parent: Int) -> Int:
     """The slot that holds a parent's block, or the free one where it would be."""
     mixed = np.uint64(parent) * level.salt
@@ -161,7 +161,7 @@ def _slot(level: Level, mask: Int, parent: Int) -> Int:
     return i
 
 
-@njit(cache=True)
+@njit
 def _place(level: Level, mask: Int, blocks: Int, node: Int) -> Int:
     """Place of a node, in a new block (number `blocks`) if its parent has none yet."""
     i = _slot(level, mask, node >> 3)
@@ -172,7 +172,7 @@ def _place(level: Level, mask: Int, blocks: Int, node: Int) -> Int:
     return 8 * (np.int64(level.slots[i]) - 1) + (node & 7)
 
 
-@njit(cache=True)
+@njit
 def _start_level(
     level: Level,
     nodes: NDArray[np.int64],  # [waiting] nodes to walk
@@ -198,7 +198,7 @@ def _start_level(
     return slots - 1
 
 
-@njit(cache=True)
+@njit
 def _look_around(
     level: Level,
     mask: Int,
@@ -244,7 +244,7 @@ def _look_around(
 # ---- single anchors
 
 
-@njit(cache=True)
+@njit
 def _code_single(
     coder: NDArray[np.int64],
     data: NDArray[np.uint8],
@@ -314,7 +314,7 @@ class Frontier(NamedTuple):
     family: NDArray[np.int16]  # occupancy of its parent's children | own child index << 8
 
 
-@njit(cache=True)
+@njit
 def _walk(
     coder: NDArray[np.int64],
     data: NDArray[np.uint8],

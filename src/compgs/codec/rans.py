@@ -11,11 +11,12 @@ depend on how many there are.
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from compgs.codec.fields import FieldReader, varint
 from compgs.codec.tables import LOOKUP_BITS, PRECISION_BITS, FrequencyTables
 from compgs.errors import CorruptSection
+from compgs.numerics.compiled import njit
 
 CHUNK_SYMBOLS = 1 << 20
 SINGLE_STATE_SYMBOLS = (
@@ -151,7 +152,7 @@ def _max_words(symbols: int) -> int:
     return symbols // 2 + 5
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _encode_one(state, position, symbol, lowest, count, offset, cumulative, words):
     """(state, position, 1 if escaped) after one symbol."""
     j = np.int64(symbol) - np.int64(lowest)
@@ -170,7 +171,7 @@ def _encode_one(state, position, symbol, lowest, count, offset, cumulative, word
     return state, position, escaped
 
 
-@njit(cache=True)
+@njit
 def _encode_chunk(symbols, index, lowest, counts, offsets, cumulative, words):
     """Fills `words` from the back; (first word used, number of escapes)."""
     position = len(words)
@@ -199,7 +200,7 @@ def _encode_chunk(symbols, index, lowest, counts, offsets, cumulative, words):
     return position, escapes
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _encode_chunks(symbols, index, lowest, counts, offsets, cumulative, words, first, escapes):
     for c in prange(len(first)):
         start = c * CHUNK_SYMBOLS
@@ -209,7 +210,7 @@ def _encode_chunks(symbols, index, lowest, counts, offsets, cumulative, words, f
         )
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _decode_one(state, position, end, offset, cumulative, lookup, words):
     """(state, position, symbol's place in its table). Past the last word, position becomes end + 1 and stays
     there.
@@ -231,7 +232,7 @@ def _decode_one(state, position, end, offset, cumulative, lookup, words):
     return state, position, j
 
 
-@njit(cache=True)
+@njit
 def _decode_chunk(words, begin, end, index, lowest, counts, offsets, cumulative, lookup, symbols):
     """Number of escapes, -1 if the words are not what an encoder writes."""
     single = len(symbols) < SINGLE_STATE_SYMBOLS
@@ -261,7 +262,7 @@ def _decode_chunk(words, begin, end, index, lowest, counts, offsets, cumulative,
     return escapes
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, lookup, symbols, escapes):
     for c in prange(len(escapes)):
         start = c * CHUNK_SYMBOLS
@@ -272,7 +273,7 @@ def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, look
         )  # fmt: skip
 
 
-@njit(cache=True)
+@njit
 def _collect_escapes(symbols, index, lowest, counts, escapes):
     """Varints of 2 (s - highest - 1) for symbols above their table, 2 (lowest - 1 - s) + 1 below it, in
     order.
@@ -294,7 +295,7 @@ def _collect_escapes(symbols, index, lowest, counts, escapes):
     return data[:size].copy()
 
 
-@njit(cache=True)
+@njit
 def _insert_escapes(symbols, index, lowest, counts, data, escapes):
     """Replace the placeholders by the escaped values. False if the bytes are not exactly those of `escapes`
     varints.
@@ -325,7 +326,7 @@ def _insert_escapes(symbols, index, lowest, counts, data, escapes):
     return position == len(data)
 
 
-@njit(cache=True)
+@njit
 def _code_length(symbols, index, lowest, counts, offsets, costs):
     bits = 0.0
     escapes = 0

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from compgs.entropy.gaussian import BLOCK, FASTMATH, SCALE_LEVELS, element_bits, gaussian_bits
 from compgs.entropy.network import FRACTION_BITS, EntropyNetwork, round_fixed
 from compgs.entropy.quantization import quantize, round_straight_through
-from compgs.numerics.linear import transposed_product
+from compgs.numerics.compiled import njit
+from compgs.tensors.linear import transposed_product
 
 Noise = Callable[[Tensor], Tensor]
 
@@ -126,7 +127,7 @@ _ONE_FIXED, _FIXED_STEP = np.float32(1 << FRACTION_BITS), np.float32(2.0**-FRACT
 _TOP = np.float32(SCALE_LEVELS - 1)
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def _quantize_row(y, out, noise, fixed, y_hat, x, s):
     """One row: y_hat, and what the likelihood sees: x [C] and scale indices s [C]."""
     c = len(y)
@@ -142,7 +143,7 @@ def _quantize_row(y, out, noise, fixed, y_hat, x, s):
         s[i] = scale
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def _code(y, out, noise, mask, fixed, y_hat, bits, by_x, by_s):
     """noise [0, C]: none; mask [0, 1]: all slots; bits [0]: not wanted."""
     n, c = y.shape
@@ -176,7 +177,7 @@ def _code(y, out, noise, mask, fixed, y_hat, bits, by_x, by_s):
             bits[i] = total
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def _gradient_row(out, by_x, by_s, g, by_y_hat, d_y, d_out):
     """A gradient that leads a scale away from the tables is dropped."""
     c = len(by_x)
@@ -191,7 +192,7 @@ def _gradient_row(out, by_x, by_s, g, by_y_hat, d_y, d_out):
         d_out[c + i] = b
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def _code_gradient(out, by_x, by_s, g, by_y_hat, d_y, d_out):
     none = np.empty(0, np.float32)
     for i in prange(len(g)):

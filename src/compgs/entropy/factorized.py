@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor, nn
+
+from compgs.numerics.compiled import njit
 
 REACH = 24  # symbols -24 to 24 have a bin of their own
 # No bin falls below this, as no symbol of an integer table has frequency 0.
@@ -74,7 +76,7 @@ def _bin(z, reach):
     return left + reach, inside - np.float32(left), max(abs(z) - bound, np.float32(0))
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def _bits(z, p, bits):
     """z [N, C], p [C, bins] -> bits [N]."""
     N, C = z.shape
@@ -88,7 +90,7 @@ def _bits(z, p, bits):
         bits[i] = total
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def _bits_gradient(z, p, g, d_z, d_p):
     """g [N], the gradient of the bits -> d_z [N, C] and parts d_p [chunks, C, bins] (zero before)."""
     N, C = z.shape

@@ -22,8 +22,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
+
+from compgs.numerics.compiled import njit
 
 SCALE_LEVELS = 128  # tables of the codec
 SCALES_PER_OCTAVE = 12
@@ -177,7 +179,7 @@ def _interval(x, s):
     return inverse, l, u, e_l, e_u, d
 
 
-@njit(fastmath=FASTMATH, cache=True, error_model="numpy")
+@njit(fastmath=FASTMATH, error_model="numpy")
 def element_bits(x, s, bits, d_x, d_s):
     """Bits and their derivatives; all flat. Kept apart from the parallel loop so that LLVM vectorizes it."""
     for i in range(np.uint64(x.size)):
@@ -190,7 +192,7 @@ def element_bits(x, s, bits, d_x, d_s):
         bits[i] = _HALF_LOG2_E * l * l - _log2(d)
 
 
-@njit(fastmath=FASTMATH, cache=True)
+@njit(fastmath=FASTMATH)
 def _element_gradient(s, g, by_x, by_s, d_x, d_s):
     """Chain rule; all flat. A gradient that leads s away from the tables is dropped."""
     for i in range(np.uint64(s.size)):
@@ -200,7 +202,7 @@ def _element_gradient(s, g, by_x, by_s, d_x, d_s):
         d_s[i] = _ZERO if (s[i] > _TOP_F and d < _ZERO) else d
 
 
-@njit(parallel=True, fastmath=FASTMATH, cache=True)
+@njit(parallel=True, fastmath=FASTMATH)
 def _bits(x, s, channels, bits, by_x, by_s):
     """x, s flat [N * C] -> bits [N] and derivatives by_x, by_s, flat as x, or empty if not wanted."""
     N = len(bits)
@@ -220,7 +222,7 @@ def _bits(x, s, channels, bits, by_x, by_s):
             bits[first + r] = total
 
 
-@njit(parallel=True, fastmath=FASTMATH, cache=True)
+@njit(parallel=True, fastmath=FASTMATH)
 def _bits_gradient(s, channels, g, by_x, by_s, d_x, d_s):
     """g [N], the gradient of the bits -> gradients d_x, d_s, flat [N * C] as s."""
     N = len(g)

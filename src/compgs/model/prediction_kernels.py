@@ -1,5 +1,5 @@
-"""Sec. 3.2 on the CPU, on numpy arrays: activations, cutoff, affine map and view embedding. `prediction.py` is its
-readable twin; training and rendering both compute by the few functions at the top.
+"""Sec. 3.2 on the CPU, on numpy arrays: activations, cutoff, affine map and view embedding. Its readable twin is
+`tensors/prediction.py`; training and rendering both compute by the few functions at the top.
 
     anchors in view ──► [f, v] times the anchors' weights ─┐
     residuals g ───────────────────────────────────────────┴─► network ──► opacity, color ──► those drawn, with geometry
@@ -13,10 +13,12 @@ primitives were drawn, then side by side. Blocks are fixed: no result depends on
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from compgs.model.constants import OPACITY_CUTOFF, SMALLEST_DISTANCE
-from compgs.model.residual_mlp_kernels import ANCHORS, CHUNKS, ROWS, activations, begin_block, tiled
+from compgs.model.network_kernels import ANCHORS, ROWS, TASKS, begin_block, hidden_layers, tiled
+from compgs.numerics.compiled import njit
+from compgs.numerics.products import multiply
 
 _FASTMATH = {"contract", "nsz", "arcp"}
 _f32 = np.float32
@@ -63,7 +65,7 @@ def _sigmoids(flat, n):
 # all primitives: each kernel fills its last arguments ---------------------------------------------------------------
 
 
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
+@njit(parallel=True, fastmath=_FASTMATH)
 def activate_opacities(
     raw,  # [P, C] of the opacity or the appearance network: opacity comes first
     opacities,  # [P]
@@ -77,7 +79,7 @@ def activate_opacities(
             opacities[i] = opacity_of_sigmoid(opacities[i])
 
 
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
+@njit(parallel=True, fastmath=_FASTMATH)
 def activate_colors(
     raw,  # [P, C] of the color or the appearance network: color comes last
     rows,  # [M] int64: those to activate
@@ -92,7 +94,7 @@ def activate_colors(
         _sigmoids(colors[first:last].ravel(), 3 * (last - first))
 
 
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
+@njit(parallel=True, fastmath=_FASTMATH)
 def affine_transform(
     raw,  # [M, 10] of the geometry network: translation, scaling, quaternion
     anchor,  # [M] int64: anchor of each primitive
@@ -120,7 +122,7 @@ def affine_transform(
                 quaternions[j, c] = raw[j, 6 + c]
 
 
-@njit(parallel=True, fastmath=_FASTMATH, cache=True)
+@njit(parallel=True, fastmath=_FASTMATH)
 def activation_gradients(
     opacities,  # [M], and so on: what `activate_...` and `affine_transform` gave
     colors,
@@ -157,7 +159,7 @@ def activation_gradients(
 # what a camera sees ---------------------------------------------------------------------------------
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def see(
     anchors,  # [V] int64: those in view
     positions,  # [N, 3] world units
@@ -171,7 +173,7 @@ def see(
         _see_block(anchors[first:last], positions, references, center, distance_unit, seen[first:last])
 
 
-@njit(fastmath=_FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=_FASTMATH, error_model="numpy")
 def _see_block(anchors, positions, references, center, distance_unit, seen):
     D = references.shape[1]
     for i in range(len(anchors)):
@@ -185,7 +187,7 @@ def _see_block(anchors, positions, references, center, distance_unit, seen):
         seen[i, D + 3] = distance / distance_unit
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def gather_geometry(
     index,  # [M] int64: those wanted
     means,  # [P, 3], and so on: of all
@@ -209,7 +211,7 @@ def block_count(anchors: int) -> int:
     return -(-anchors // ANCHORS)
 
 
-@njit(parallel=True, fastmath=_FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=_FASTMATH, error_model="numpy")
 def paired_appearance(
     anchors,  # [V] int64, ascending: those in view
     first_coupled,  # [N + 1] int64: first coupled primitive of each anchor
@@ -232,8 +234,7 @@ def paired_appearance(
 ):
     V, D, G, H = len(anchors), references.shape[1], residuals.shape[1], len(output_weight)
     blocks, layers = len(drawn), len(weights1)
-    # Several blocks to a task: scratch memory is allocated once per task.
-    tasks = min(blocks, 8 * CHUNKS)
+    tasks = min(blocks, TASKS)
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
     for t in prange(tasks):
         seen = np.empty((ANCHORS, D + 4), np.float32)
@@ -242,7 +243,7 @@ def paired_appearance(
         row = np.empty(ROWS, np.int64)
         first = np.empty((ROWS, H + 4), np.float32)
         x = np.empty((layers + 1, ROWS, H), np.float32)
-        h = np.empty((layers, ROWS, H), np.float32)
+        h = np.empty((ROWS, H), np.float32)
         for block in range(blocks * t // tasks, blocks * (t + 1) // tasks):
             v0, v1 = block * ANCHORS, min(V, (block + 1) * ANCHORS)
             _see_block(anchors[v0:v1], positions, references, center, distance_unit, seen)
@@ -258,7 +259,7 @@ def paired_appearance(
                     row[i] = v - v0
                     for c in range(G):
                         own[i, c] = residuals[p, c]
-                activations(
+                hidden_layers(
                     own[:n],
                     row[:n],
                     shared,
@@ -272,13 +273,13 @@ def paired_appearance(
                     h,
                 )
                 out = appearance[place : place + n]
-                np.dot(x[layers, :n], output_weight, out)
+                multiply(x[layers, :n], output_weight, out)
                 count += _activate(out, first, H)
                 place += n
             drawn[block] = count
 
 
-@njit(fastmath=_FASTMATH, error_model="numpy", cache=True)
+@njit(fastmath=_FASTMATH, error_model="numpy")
 def _activate(out, first, H):
     """Adds the skip to out [n, 4] and activates it in place; returns how many primitives are drawn."""
     n = len(out)
@@ -296,7 +297,7 @@ def _activate(out, first, H):
     return count
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def gather_drawn(
     anchors, first_coupled, places, appearance, offsets,
     means, scales, quaternions,

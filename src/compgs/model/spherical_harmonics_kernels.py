@@ -3,7 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from compgs.numerics.compiled import njit
 
 _PI = math.pi
 # Norms of the basis functions: Y<degree>, and the monomials that they belong to.
@@ -68,7 +70,7 @@ def _along(x, y, z, degree, g):
     return gx, gy, gz
 
 
-@njit(parallel=True, fastmath=_FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=_FASTMATH, error_model="numpy")
 def view_colors(
     means,  # [M, 3] world units
     dc,  # [M, 3] coefficients of degree 0
@@ -96,7 +98,7 @@ def view_colors(
             colors[i, 0], colors[i, 1], colors[i, 2] = max(red, _ZERO), max(green, _ZERO), max(blue, _ZERO)
 
 
-@njit(parallel=True, fastmath=_FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=_FASTMATH, error_model="numpy")
 def view_colors_gradient(
     means,
     rest,

@@ -15,8 +15,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from compgs.numerics.compiled import njit
 from compgs.render.settings import RasterSettings
 
 TILE_WIDTH = 8  # pixels
@@ -174,7 +175,7 @@ def pixel_interval(low, high, size):
     return first, last
 
 
-@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def find_visible(
     means,
     covariances,
@@ -216,7 +217,7 @@ def find_visible(
         found[chunk], room[chunk] = n, tiles
 
 
-@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def find_tiles(
     means, covariances, determinants, colors, log2_cutoff, tiles_x, visible, boxes, room,
     packed, slots, rows, first_slot, slots_used, counts,
@@ -277,7 +278,7 @@ def find_tiles(
             slots_used[i] = slot - first
 
 
-@njit(cache=True)
+@njit
 def start_tiles(counts, starts):
     """Exclusive sums over tiles, then chunks: `counts` becomes where each chunk writes. Returns the total."""
     chunks, tiles = counts.shape
@@ -292,7 +293,7 @@ def start_tiles(counts, starts):
     return position
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, entries, keys):
     """Writes the tiles' entries and depth keys; the slots then say where a splat's entries are."""
     bits = depths.view(np.uint32)  # depths are positive: their bits sort as they do
@@ -311,7 +312,7 @@ def fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, ent
                 slots[slot] = to
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True)
 def sort_tiles(starts, keys, order):
     """`order` [E]: each tile's entries by `keys` [E], equal ones as they come. It may take the place of the keys."""
     tiles = starts.shape[0] - 1
@@ -325,7 +326,7 @@ def sort_tiles(starts, keys, order):
                 sort_many(keys[begin:end], order[begin:end], begin)
 
 
-@njit(cache=True)
+@njit
 def sort_few(keys, order, begin):
     """Insertion sort."""
     sorted_keys = np.empty(FEW, np.uint32)
@@ -337,7 +338,7 @@ def sort_few(keys, order, begin):
         sorted_keys[at], order[at] = key, begin + i
 
 
-@njit(cache=True)
+@njit
 def sort_many(keys, order, begin):
     """Radix sort over those digits in which keys differ."""
     n = keys.shape[0]

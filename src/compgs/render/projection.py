@@ -10,14 +10,12 @@ so results do not depend on the number of threads.
 """
 
 import math
-from typing import Any
 
 import numpy as np
-import torch
-from numba import njit, prange
-from torch import Tensor
+from numba import prange
 
 from compgs.cameras import Camera
+from compgs.numerics.compiled import njit
 from compgs.render.settings import RasterSettings, jacobian_limits
 
 # No "nnan", "ninf": comparisons with NaN decide what is drawn.
@@ -80,7 +78,7 @@ def load_block(s, first, count, means, quaternions, scales):
         s[i + SZ] = scales[j, 2]
 
 
-@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def project_forward(means, quaternions, scales, k, means2d, covariances, depths, determinants):
     """Fills means2d [M, 2], covariances [M, 3], depths [M], determinants [M]; a depth of inf: not drawn."""
     m = means.shape[0]
@@ -145,7 +143,7 @@ def project_forward(means, quaternions, scales, k, means2d, covariances, depths,
             determinants[j] = s[i + OUT_DET]
 
 
-@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def project_backward(
     means,
     quaternions,
@@ -280,54 +278,3 @@ def project_backward(
             grad_scales[j, 0] = s[i + SX]
             grad_scales[j, 1] = s[i + SY]
             grad_scales[j, 2] = s[i + SZ]
-
-
-class Project(torch.autograd.Function):
-    """means2d [M, 2], covariances [M, 3] (xx, xy, yy); without gradient: depths [M], determinants [M]."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, numbers: np.ndarray
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        m = len(means)
-        means2d, covariances = means.new_empty(m, 2), means.new_empty(m, 3)
-        depths, determinants = means.new_empty(m), means.new_empty(m)
-        project_forward(
-            as_array(means),
-            as_array(quaternions),
-            as_array(scales),
-            numbers,
-            as_array(means2d),
-            as_array(covariances),
-            as_array(depths),
-            as_array(determinants),
-        )
-        ctx.save_for_backward(means, quaternions, scales, depths)
-        ctx.numbers = numbers
-        ctx.mark_non_differentiable(depths, determinants)
-        return means2d, covariances, depths, determinants
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        means, quaternions, scales, depths = ctx.saved_tensors
-        grad_means, grad_quaternions, grad_scales = (
-            torch.empty(t.shape) for t in (means, quaternions, scales)
-        )
-        project_backward(
-            as_array(means),
-            as_array(quaternions),
-            as_array(scales),
-            ctx.numbers,
-            as_array(depths),
-            as_array(gradients[0]),
-            as_array(gradients[1]),
-            as_array(grad_means),
-            as_array(grad_quaternions),
-            as_array(grad_scales),
-        )
-        return grad_means, grad_quaternions, grad_scales, None
-
-
-def as_array(tensor: Tensor) -> np.ndarray:
-    """The tensor's own memory; a copy only where it is not contiguous."""
-    return tensor.detach().contiguous().numpy()

@@ -18,8 +18,9 @@ variables (rather than in the buffer) spare the compiled code a check for overla
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from compgs.numerics.compiled import njit
 from compgs.numerics.vector_sums import add_in_any_order
 from compgs.render.binning import (
     CHUNKS,
@@ -62,7 +63,7 @@ def exp2_minus(q):
     return p * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
 
 
-@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def blend_forward(packed, starts, entries, order, background, cutoff, cap, stop, image, transmittance, ends):
     """Fills image [H, W, 3], transmittance [H, W] and, per tile, the entry after the last one needed."""
     height, width = transmittance.shape
@@ -145,7 +146,7 @@ def start_tile(s, left, top, width, height):
             s[pixel + ROW] = f32(row)
 
 
-@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def blend_backward(
     packed, starts, entries, order, ends, cutoff, cap, stop,
     image, transmittance, grad_image, grad_transmittance, moments,
@@ -236,7 +237,7 @@ def blend_backward(
                 moments[order[e], moment] = ZERO
 
 
-@njit(parallel=True, fastmath=FASTMATH, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def sum_moments(
     visible, packed, first_slot, slots_used, slots, moments, opacities,
     grad_means, grad_covariances, grad_opacities, grad_colors,

@@ -13,8 +13,11 @@ from compgs.scene.capture import Capture, PosedImage, check_inside
 from compgs.scene.colmap import find_sparse_model
 from compgs.scene.colmap_capture import read_colmap
 from compgs.scene.images import Progress, image_size, load_views
+from compgs.scene.masks import FOLDER as MASKS
+from compgs.scene.masks import find_mask
 from compgs.scene.nerfstudio import read_nerfstudio
 from compgs.scene.points import MIN_POINTS, fallback_points
+from compgs.scene.unused import unposed_photographs
 from compgs.scene.views import Points, Scene, View, scene_extent
 
 __all__ = ["Points", "Scene", "View", "as_scene", "load_scene"]
@@ -35,6 +38,9 @@ def load_scene(
 ) -> Scene:
     """Reads a capture: COLMAP, Blender (`transforms_train.json`) or nerfstudio (`transforms.json`).
 
+    What masks and transparent pixels leave out is in the views' `mask` (`compgs.scene.masks`); with a `background` that
+    is given, and in Blender scenes, transparent pixels show it instead.
+
     Raises SceneError or one of its kinds for missing, damaged or contradicting data, else ConfigError.
     """
     check_reading(downscale, test_every, background)
@@ -43,10 +49,13 @@ def load_scene(
     _check_views(capture, folder)
     for posed in capture.images:
         check_inside(posed.path, (folder, folder / images), f"the image of the view {posed.name!r}")
+    unposed = unposed_photographs(folder / images, [posed.path for posed in capture.images])
+    capture = _with_masks(capture, folder, images)
     capture, downscale = _prescaled(capture, folder, images, downscale)
 
     behind = background or capture.background
-    views = load_views(capture.images, downscale, behind, progress)
+    cut_out = capture.cut_out and background is None
+    views = load_views(capture.images, downscale, None if cut_out else behind, progress)
     held_out = _held_out(capture, test_every) if holdout else frozenset()
     points, notes = _enough_points(capture, views)
     return Scene(
@@ -57,7 +66,7 @@ def load_scene(
         background=behind,
         extent=_extent(views, points),
         source=folder,
-        notes=capture.notes + notes,
+        notes=capture.notes + unposed + notes,
     )
 
 
@@ -104,8 +113,7 @@ def _read_layout(folder: Path, images: str) -> Capture:
         raise MissingSparseModel(
             f"{folder}: no camera poses found; expected a COLMAP sparse model (cameras.bin, images.bin and "
             f"points3D.bin in sparse/0), transforms_train.json (Blender) or transforms.json (nerfstudio). "
-            f"For photographs alone, run: colmap automatic_reconstructor --workspace_path "
-            f"{shlex.quote(str(folder))} --image_path {shlex.quote(str(folder / images))}"
+            f"For photographs alone, or a video, run: compgs reconstruct {shlex.quote(str(folder))} -o SCENE"
         )
     return replace(capture, images=tuple(sorted(capture.images, key=lambda posed: posed.name)))
 
@@ -117,6 +125,44 @@ def _check_views(capture: Capture, folder: Path) -> None:
             raise SceneError(f"{folder}: the view {name!r} has more than one pose; remove the others")
     if len(names) < 2:
         raise SceneError(f"{folder}: {len(names)} view with a pose; a scene needs at least 2")
+
+
+def _with_masks(capture: Capture, folder: Path, images: str) -> Capture:
+    """With the files of `masks/`, and what of it is not used. Raises SceneError for masks outside of the scene."""
+    masks = folder / MASKS
+    if masks.is_dir():
+        capture = replace(
+            capture,
+            images=tuple(
+                posed
+                if posed.mask
+                else replace(posed, mask=_mask_of(posed, masks, (folder / images, folder)))
+                for posed in capture.images
+            ),
+        )
+    for posed in capture.images:
+        if posed.mask is not None:
+            check_inside(posed.mask, (folder,), f"the mask of the view {posed.name!r}")
+    masked = sum(posed.mask is not None for posed in capture.images)
+    if not masks.is_dir() and not masked:
+        return capture
+    if masked == 0:
+        note = f"{MASKS}/ is not used: it has a mask for no view; names are as in {images}/, with .png at the end"
+    else:
+        note = (
+            f"masks: {masked} of {len(capture.images)} views have one; where it is black, pixels do not count"
+        )
+    return replace(capture, notes=(*capture.notes, note))
+
+
+def _mask_of(posed: PosedImage, masks: Path, folders: tuple[Path, ...]) -> Path | None:
+    """By the name of the photograph relative to the first of the folders that it is in."""
+    for folder in folders:
+        if posed.path.is_relative_to(folder):
+            found = find_mask(masks, str(posed.path.relative_to(folder)))
+            if found is not None:
+                return found
+    return None
 
 
 def _prescaled(capture: Capture, folder: Path, images: str, downscale: int) -> tuple[Capture, int]:

@@ -23,6 +23,7 @@ class PosedImage:
     path: Path
     camera: Camera
     distortion: Distortion | None = None  # None: the image is a pinhole image already
+    mask: Path | None = None  # file that says which pixels count (`scene/masks.py`); None: all
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,7 @@ class Capture:
     points: Points
     points_source: str  # the file of the points, for messages
     background: tuple[float, float, float]  # what the layout's images stand on by default
+    cut_out: bool = True  # transparent pixels do not count; False: they show the background
     notes: tuple[str, ...] = ()
 
 

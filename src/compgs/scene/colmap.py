@@ -118,6 +118,18 @@ def read_sparse_model(folder: Path) -> SparseModel:
     return SparseModel(folder, cameras, images, points)
 
 
+def count_images(folder: Path) -> int:
+    """Registered images of a sparse model, from as little of it as possible; 0 where there is none to be read."""
+    try:
+        if (folder / "images.bin").is_file():
+            with (folder / "images.bin").open("rb") as file:
+                promised = int.from_bytes(file.read(_COUNT.size), "little")
+            return min(promised, (folder / "images.bin").stat().st_size // _POSE.size)
+        return sum(len(line.split()) == 10 for _, line in _content_lines(folder / "images.txt"))
+    except OSError:
+        return 0
+
+
 _PARTS = ("cameras", "images", "points3D")
 _Result = TypeVar("_Result")
 

@@ -10,6 +10,7 @@ from compgs.numerics.rotations import rigid, rotation_from_quaternion
 from compgs.scene.capture import Capture, PosedImage, check_camera, usable_positions
 from compgs.scene.colmap import UNDISTORT_COMMAND, ColmapCamera, ColmapImage, read_sparse_model
 from compgs.scene.undistort import MODELS, Distortion
+from compgs.scene.unused import larger_models
 from compgs.scene.views import Points
 
 # Models with one focal length for both axes
@@ -31,8 +32,11 @@ def read_colmap(folder: Path, sparse: Path, images: Path) -> Capture:
         posed.append(PosedImage(image.name, images / image.name, camera, lens))
     finite = usable_positions(model.points.positions)
     points = Points(model.points.positions[finite], model.points.colors[finite])
-    notes = (f"{(~finite).sum()} points without a finite position were left out",) if not finite.all() else ()
-    return Capture(tuple(posed), None, points, str(sparse), (0.0, 0.0, 0.0), notes)
+    notes: tuple[str, ...] = ()
+    if not finite.all():
+        notes = (f"{(~finite).sum()} points without a finite position were left out",)
+    notes += larger_models(sparse, len(posed))
+    return Capture(tuple(posed), None, points, str(sparse), (0.0, 0.0, 0.0), notes=notes)
 
 
 def _pose(image: ColmapImage, place: str) -> np.ndarray:

@@ -15,6 +15,7 @@ from compgs.cameras import Camera
 from compgs.errors import ConfigError, SceneError, UnreadableImage, UnsupportedCamera
 from compgs.scene.capture import PosedImage
 from compgs.scene.image_cache import ImageCache
+from compgs.scene.masks import OPAQUE, mask_of_brightness, resized_mask, undistorted_mask
 from compgs.scene.undistort import sample_bicubic, undistorted_camera, undistortion_map
 from compgs.scene.views import View
 
@@ -22,8 +23,11 @@ from compgs.scene.views import View
 # is a program, and others of which a decoder is an unneeded risk. (MPO: JPEG of cameras that store several images.)
 FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "JPEG2000", "AVIF")
 
+# Of HEIF files whose pictures are HEVC; Pillow has no decoder for them.
+HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+
 # What Pillow raises for damaged files, besides OSError
-_DAMAGED = (OSError, ValueError, SyntaxError, EOFError, IndexError, MemoryError, Image.DecompressionBombError)
+DAMAGED = (OSError, ValueError, SyntaxError, EOFError, IndexError, MemoryError, Image.DecompressionBombError)
 
 MIN_SIDE = 4  # pixels: what downscaling must leave of an image
 
@@ -34,20 +38,32 @@ _Result = TypeVar("_Result")
 def image_size(file: Path) -> tuple[int, int]:
     """(width, height) in pixels, from the header alone. Raises UnreadableImage."""
     try:
-        with _opened(file) as image:
+        with open_image(file) as image:
             return image.size
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """What a view shows."""
+
+    image: np.ndarray  # [H, W, 3] uint8, display RGB
+    mask: np.ndarray | None  # [H, W] bool, True where a pixel counts; None: all do
+
+    @property
+    def nbytes(self) -> int:
+        return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
 
 
 def load_views(
     images: Sequence[PosedImage],
     downscale: int,
-    background: tuple[float, float, float],
+    background: tuple[float, float, float] | None,  # behind transparent pixels; None: these do not count
     progress: Progress | None = None,
-    cache: ImageCache | None = None,
+    cache: ImageCache[Photograph] | None = None,
 ) -> list[View]:
-    """The views at 1 / downscale of their images' size, in the given order.
+    """The views at 1 / downscale of their images' size, in the given order, with their masks.
 
     Headers, sizes and cameras are checked. Images that all fit into the cache are decoded at once, and so checked; of a
     larger capture each is decoded when its view is looked at.
@@ -70,20 +86,24 @@ def load_views(
             return camera, None
         return maps.get(replace(posed, camera=camera))
 
-    def read(index: int) -> np.ndarray:
-        pixels = read_image(images[index].path, background)
+    def read(index: int) -> Photograph:
+        photograph = read_photograph(images[index], background)
+        pixels, mask = photograph.image, photograph.mask
         camera, positions = undistorted(index)
         if positions is not None:
             pixels = sample_bicubic(pixels, positions)
-        width, height = downscaled_size((camera.width, camera.height), downscale)
-        if (width, height) != (camera.width, camera.height):
-            pixels = np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
-        return np.ascontiguousarray(pixels)
+            mask = None if mask is None else undistorted_mask(mask, positions)
+        size = downscaled_size((camera.width, camera.height), downscale)
+        if size != (camera.width, camera.height):
+            pixels = np.asarray(Image.fromarray(pixels).resize(size, Image.Resampling.BOX))
+            mask = None if mask is None else resized_mask(mask, size)
+        return Photograph(np.ascontiguousarray(pixels), mask)
 
     def view(index: int) -> View:
         camera, _ = undistorted(index)
         width, height = downscaled_size((camera.width, camera.height), downscale)
-        return View(images[index].name, camera.resized(width, height), _Stored(cache, index, read))
+        stored = _Stored(cache, index, read)
+        return View(images[index].name, camera.resized(width, height), stored.image, stored.mask)
 
     views = _in_threads(view, len(images), None)
     if sum(3 * view.camera.width * view.camera.height for view in views) <= cache.most_bytes:
@@ -93,14 +113,17 @@ def load_views(
 
 @dataclass(frozen=True, eq=False)
 class _Stored:
-    """An image of a cache, read when it is wanted."""
+    """A photograph of a cache, read when it is wanted."""
 
-    cache: ImageCache
+    cache: ImageCache[Photograph]
     index: int
-    read: Callable[[int], np.ndarray]
+    read: Callable[[int], Photograph]
 
-    def __call__(self) -> np.ndarray:
-        return self.cache.get(self.index, lambda: self.read(self.index))
+    def image(self) -> np.ndarray:
+        return self.cache.get(self.index, lambda: self.read(self.index)).image
+
+    def mask(self) -> np.ndarray | None:
+        return self.cache.get(self.index, lambda: self.read(self.index)).mask
 
 
 def downscaled_size(size: tuple[int, int], downscale: int) -> tuple[int, int]:
@@ -108,36 +131,69 @@ def downscaled_size(size: tuple[int, int], downscale: int) -> tuple[int, int]:
     return max(1, round(size[0] / downscale)), max(1, round(size[1] / downscale))
 
 
-def read_image(file: Path, background: tuple[float, float, float]) -> np.ndarray:
-    """[H, W, 3] uint8 RGB; transparent images are composited on the background. Raises UnreadableImage.
+def read_photograph(posed: PosedImage, background: tuple[float, float, float] | None) -> Photograph:
+    """The pixels of an image, and which of them count by its transparency and its mask. Raises UnreadableImage."""
+    image, mask = read_image(posed.path, background)
+    if posed.mask is not None:
+        size = image.shape[1], image.shape[0]
+        own = resized_mask(_read_mask(posed.mask, posed.path, size), size)
+        mask = own if mask is None else mask & own
+    return Photograph(image, None if mask is None or mask.all() else mask)
 
+
+def read_image(
+    file: Path, background: tuple[float, float, float] | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """[H, W, 3] uint8 RGB, and [H, W] bool, True where more than half opaque. Raises UnreadableImage.
+
+    With a background, transparent images are composited on it, and there is no mask; nor is there for opaque images.
     The orientation tag is ignored, as structure from motion ignores it: poses belong to the stored pixels.
     """
     try:
-        with _opened(file) as image:
+        with open_image(file) as image:
             image.load()
             return _rgb(image, background)
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
 
 
-def _opened(file: Path) -> Image.Image:
-    """Of the formats that this Pillow has."""
+def _read_mask(file: Path, photograph: Path, size: tuple[int, int]) -> np.ndarray:
+    """[H, W] bool, of the file's own size, which must have the proportions of `size`. Raises UnreadableImage."""
+    try:
+        with open_image(file) as image:
+            width, height = image.size
+            if abs(width / size[0] - height / size[1]) > 1 / size[0] + 1 / size[1]:
+                raise UnreadableImage(
+                    f"{file}: the mask has {width}x{height} pixels, its photograph {photograph.name} "
+                    f"{size[0]}x{size[1]}; make a mask of the photograph's proportions"
+                )
+            gray = image if image.mode.startswith("I") or image.mode == "F" else image.convert("L")
+            return mask_of_brightness(np.asarray(gray))
+    except DAMAGED as error:
+        raise UnreadableImage(_reason(file, error)) from error
+
+
+def open_image(file: Path) -> Image.Image:
+    """Opened, if of one of the FORMATS that this Pillow has; only the header is read. Raises what is in DAMAGED."""
     Image.init()
     return Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN])
 
 
-def _rgb(image: Image.Image, background: tuple[float, float, float]) -> np.ndarray:
+def _rgb(
+    image: Image.Image, background: tuple[float, float, float] | None
+) -> tuple[np.ndarray, np.ndarray | None]:
     if image.mode.startswith("I") or image.mode == "F":  # 16 bits per sample, gray
         gray = np.asarray(image).astype(np.float64)
         eight = np.clip(np.round(gray / 257), 0, 255).astype(np.uint8)
-        return np.repeat(eight[:, :, None], 3, axis=2)
+        return np.repeat(eight[:, :, None], 3, axis=2), None
     if "A" in image.getbands() or "transparency" in image.info:
-        rgba = np.asarray(image.convert("RGBA")).astype(np.float32)
-        alpha = rgba[:, :, 3:] / 255
+        rgba = np.asarray(image.convert("RGBA"))
+        if background is None:
+            return np.ascontiguousarray(rgba[:, :, :3]), rgba[:, :, 3] > OPAQUE
+        alpha = rgba[:, :, 3:].astype(np.float32) / 255
         behind = np.asarray(background, dtype=np.float32) * 255
-        return np.round(rgba[:, :, :3] * alpha + behind * (1 - alpha)).astype(np.uint8)
-    return np.array(image.convert("RGB"))
+        return np.round(rgba[:, :, :3] * alpha + behind * (1 - alpha)).astype(np.uint8), None
+    return np.array(image.convert("RGB")), None
 
 
 def _checked_cameras(images: Sequence[PosedImage]) -> list[Camera]:
@@ -215,7 +271,22 @@ def _more(count: int, what: str) -> str:
     return f" ({count} more {'is' if count == 1 else 'are'} {what})" if count else ""
 
 
+def is_heic(file: Path) -> bool:
+    """Whether a file is a photograph as iPhones store it, whatever it is called."""
+    try:
+        with file.open("rb") as content:
+            head = content.read(12)
+    except OSError:
+        return False
+    return head[4:8] == b"ftyp" and head[8:] in HEIC_BRANDS
+
+
 def _reason(file: Path, error: BaseException) -> str:
+    if is_heic(file):
+        return (
+            f"{file}: HEIC images are not read; convert all of them to JPEG, as with heif-convert, and name those "
+            "files in the poses"
+        )
     if isinstance(error, Image.DecompressionBombError):
         return f"{file}: the image is too large ({error}); give smaller copies of all images"
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)

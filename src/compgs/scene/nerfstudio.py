@@ -1,5 +1,6 @@
 """The layout of nerfstudio and instant-ngp: one `transforms.json`, intrinsics for all frames or for each."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from compgs.errors import SceneError, UnsupportedCamera
 from compgs.scene.capture import Capture, PosedImage, check_camera, check_inside
 from compgs.scene.images import image_size
 from compgs.scene.ply_points import read_ply_points
+from compgs.scene.split_names import split_by_names
 from compgs.scene.transforms import file_path, number, read_transforms, world_to_camera
 from compgs.scene.undistort import Distortion
 from compgs.scene.views import Points
@@ -35,18 +37,43 @@ def read_nerfstudio(folder: Path) -> Capture:
     for index, frame in enumerate(values["frames"]):
         place = f"{file}, frame {index}"
         relative = file_path(frame, place)
-        posed.append(_posed_image(relative, folder / relative, {**shared, **frame}, place))
+        check_inside(
+            folder / relative, (folder,), f"the image of frame {index} in {file.name}, {relative!r},"
+        )
+        image = _posed_image(relative, folder / relative, {**shared, **frame}, place)
+        posed.append(replace(image, mask=_mask(folder, frame, place)))
     if not posed:
         raise SceneError(f"{file}: no frames; expected at least two views")
-    return Capture(tuple(posed), None, _points(folder, values), str(file), (0.0, 0.0, 0.0))
+    points, of_points = _points(folder, values)
+    used, held_out, of_split = split_by_names(posed, values, str(file))
+    return Capture(used, held_out, points, str(file), (0.0, 0.0, 0.0), notes=(*of_points, *of_split))
 
 
-def _points(folder: Path, values: dict[str, Any]) -> Points:
+def _mask(folder: Path, frame: dict[str, Any], place: str) -> Path | None:
+    """The file that a frame names. Raises SceneError if it is not there."""
+    if frame.get("mask_path") is None:
+        return None
+    relative = file_path(frame, place, "mask_path")
+    check_inside(folder / relative, (folder,), f"mask_path {relative!r}")
+    if not (folder / relative).is_file():
+        raise SceneError(
+            f"{place}: mask_path: {folder / relative} does not exist; restore it, or leave mask_path out"
+        )
+    return folder / relative
+
+
+def _points(folder: Path, values: dict[str, Any]) -> tuple[Points, tuple[str, ...]]:
+    """Of `ply_file_path`, else none, and what is to be noted."""
+    nothing = Points(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
     ply = values.get("ply_file_path")
-    if isinstance(ply, str) and (folder / ply).is_file():
-        check_inside(folder / ply, (folder,), f"ply_file_path {ply!r}")
-        return read_ply_points(folder / ply)
-    return Points(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
+    if ply is None:
+        return nothing, ()
+    if not isinstance(ply, str):
+        raise SceneError(f"{folder / 'transforms.json'}: ply_file_path is {ply!r:.60}; expected a path")
+    check_inside(folder / ply, (folder,), f"ply_file_path {ply!r}")
+    if not (folder / ply).is_file():
+        return nothing, (f"ply_file_path: {folder / ply} does not exist: the points in it are not used",)
+    return read_ply_points(folder / ply), ()
 
 
 def _posed_image(name: str, path: Path, values: dict[str, Any], place: str) -> PosedImage:

@@ -7,9 +7,9 @@ shadows depend on the position in space alone, never on pixels: all views show t
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from compgs.cameras import Camera
+from compgs.numerics.compiled import njit
 
 SPHERE, BOX, CYLINDER, GROUND, BACKDROP = range(5)
 TILES, MARBLE, STRIPES, SPOTS, BRICKS, WOOD, LANDSCAPE = range(7)
@@ -69,7 +69,7 @@ def _light_disk() -> np.ndarray:
 # row, made for every ray, costs more than the intersection.
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _hit(ox, oy, oz, dx, dy, dz, kinds, shapes, s):
     """(distance, normal x, y, z) of a ray with solid s; the distance is _FAR without a hit."""
     kind = kinds[s]
@@ -124,7 +124,7 @@ def _hit(ox, oy, oz, dx, dy, dz, kinds, shapes, s):
     return near, 0.0, 0.0, sign
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _hit_cylinder(ox, oy, oz, dx, dy, dz, radius, half_height, cos, sin):
     best, nx, ny, nz = _FAR, 0.0, 0.0, 1.0
     a = dx * dx + dy * dy
@@ -144,7 +144,7 @@ def _hit_cylinder(ox, oy, oz, dx, dy, dz, radius, half_height, cos, sin):
     return best, nx, ny, nz
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _trace(origins, directions, kinds, shapes):
     distances = np.full(len(origins), _FAR)
     for i in range(len(origins)):
@@ -156,7 +156,7 @@ def _trace(origins, directions, kinds, shapes):
     return distances
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _in_shadow(x, y, z, lx, ly, lz, kinds, shapes):
     for s in range(len(kinds)):
         if kinds[s] >= GROUND:  # casts none: everything stands on it or within it
@@ -169,7 +169,7 @@ def _in_shadow(x, y, z, lx, ly, lz, kinds, shapes):
 # Textures: mixtures of two colors, by noise on a lattice of random numbers
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _random(i, j, k):
     """A number in [0, 1) that belongs to a cell of the lattice."""
     h = np.uint32(i * 374761393 + j * 668265263 + k * 974634721)
@@ -178,7 +178,7 @@ def _random(i, j, k):
     return (h ^ (h >> np.uint32(16))) / 4294967296.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _noise(x, y, z):
     """Smooth noise in [0, 1], features of size 1."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
@@ -193,20 +193,20 @@ def _noise(x, y, z):
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _clouds(x, y, z):
     """Three octaves of noise, in [0, 1]."""
     return (4 * _noise(x, y, z) + 2 * _noise(2 * x, 2 * y, 2 * z) + _noise(4 * x, 4 * y, 4 * z)) / 7
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _ramp(x, low, high):
     """0 below low, 1 above high, smooth between."""
     x = min(max((x - low) / (high - low), 0.0), 1.0)
     return x * x * (3 - 2 * x)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _mixture(texture, x, y, z, nx, ny, nz):
     """(share of the second color, brightness) at a point in the solid's own axes; n is the normal there."""
     if texture == TILES:
@@ -243,7 +243,7 @@ def _mixture(texture, x, y, z, nx, ny, nz):
     return 0.0, 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _landscape(x, y, z, radius):
     """Linear RGB of the backdrop: hills in front of a sky with clouds."""
     ux, uy, uz = x / radius, y / radius, z / radius
@@ -264,7 +264,7 @@ def _landscape(x, y, z, radius):
     return r + hill * (0.10 * leaf - r), g + hill * (0.20 * leaf - g), b + hill * (0.07 * leaf - b)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _shade(ox, oy, oz, dx, dy, dz, sun, disk, sample, kinds, shapes, textures, colors, gloss):
     """Linear RGB along a ray of unit direction; every fourth direction of the disk decides on shadow."""
     best, hit, nx, ny, nz = _FAR, -1, 0.0, 0.0, 1.0
@@ -307,7 +307,7 @@ def _shade(ox, oy, oz, dx, dy, dz, sun, disk, sample, kinds, shapes, textures, c
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _render(
     width,
     height,

@@ -36,12 +36,17 @@ def number(values: dict[str, Any], key: str, place: str) -> float:
     return float(value)
 
 
-def file_path(frame: dict[str, Any], place: str) -> str:
-    """Path of a frame's image, relative to the JSON file, "/" between its parts."""
-    value = frame.get("file_path")
+def file_path(frame: dict[str, Any], place: str, key: str = "file_path") -> str:
+    """Path of a frame's image (or what `key` names), relative to the JSON file, "/" between its parts."""
+    value = frame.get(key)
     if not isinstance(value, str) or not value:
-        raise SceneError(f"{place}: file_path is {value!r}; expected the path of the frame's image")
-    return value.replace("\\", "/").removeprefix("./")
+        raise SceneError(f"{place}: {key} is {value!r}; expected the path of the frame's image")
+    return as_name(value)
+
+
+def as_name(path: str) -> str:
+    """A path as the names of views are written."""
+    return path.replace("\\", "/").removeprefix("./")
 
 
 def world_to_camera(frame: dict[str, Any], place: str) -> np.ndarray:

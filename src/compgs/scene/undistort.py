@@ -8,10 +8,10 @@ every pixel of the undistorted image asks where the lens has put it.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from compgs.cameras import Camera
 from compgs.errors import UnsupportedCamera
+from compgs.numerics.compiled import njit
 
 MODELS = (
     "SIMPLE_RADIAL",
@@ -158,7 +158,7 @@ def undistortion_map(source: Camera, target: Camera, lens: Distortion) -> np.nda
     return np.stack(np.broadcast_arrays(u, v), axis=-1).astype(np.float32)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _cubic(t: np.float32) -> tuple:
     """Weights of the four samples around a position t in [0, 1) between the inner two (Catmull and Rom)."""
     return (
@@ -169,7 +169,7 @@ def _cubic(t: np.float32) -> tuple:
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def sample_bicubic(image: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """image [H, W, 3] uint8, positions [h, w, 2] (u, v) pixels -> [h, w, 3] uint8; edges are extended."""
     height, width = image.shape[0], image.shape[1]

@@ -18,11 +18,18 @@ class View:
     pixels: (
         np.ndarray | Callable[[], np.ndarray]
     )  # [H, W, 3] uint8, display RGB, undistorted; or what reads them
+    # [H, W] bool, True where a pixel counts (`scene/masks.py`), or what reads it; None: all count
+    counted: np.ndarray | Callable[[], np.ndarray | None] | None = None
 
     @property
     def image(self) -> np.ndarray:
         """[H, W, 3] uint8, display RGB, undistorted; perhaps read only now. Raises UnreadableImage."""
-        return self.pixels if isinstance(self.pixels, np.ndarray) else self.pixels()
+        return self.pixels() if callable(self.pixels) else self.pixels
+
+    @property
+    def mask(self) -> np.ndarray | None:
+        """[H, W] bool, True where a pixel counts in training and in metrics; None: all. Raises UnreadableImage."""
+        return self.counted() if callable(self.counted) else self.counted
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,14 +18,14 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import SplatConfig
-from compgs.model.splats import Splats
-from compgs.training.splat_parameters import SplatParameters, replace_splats
+from compgs.tensors.splats import Splats
 
 PUBLISHED_START, PUBLISHED_EVERY, PUBLISHED_RESET = 500, 100, 3_000  # steps
 RECOVERY_PASSES = 5  # over the views
 RECOVERY_STEPS = 300  # at the published rate, a logit needs a hundred to climb from an opacity of 0.01 to 0.5
 SPLIT_INTO = 2
 SPLIT_SHRINK = 1.6  # 0.8 x the number of parts: how much smaller a part is
+LOG_SHRINK = torch.log(torch.tensor(SPLIT_SHRINK)).item()
 
 
 @dataclass(frozen=True)
@@ -87,28 +87,45 @@ class DensityControl:
         self.gradient += (mean_gradient * half_image).norm(dim=1)  # (zero where it was not drawn)
         self.seen += visible
 
+    def forget(self, splats: int) -> None:
+        """Statistics of so many splats start anew."""
+        self.gradient = self.gradient.new_zeros(splats)
+        self.seen = self.seen.new_zeros(splats)
+
+    def keep(self, kept: Tensor) -> None:
+        """Only the splats of `kept` [M] bool are left."""
+        self.gradient, self.seen = self.gradient[kept], self.seen[kept]
+
     @torch.no_grad()
-    def act(
+    def chosen(
         self,
-        parameters: SplatParameters,
-        optimizer: torch.optim.Adam,
+        splats: Splats,
+        drawn: Splats,  # the same splats as they are drawn, by which they are judged
         chance: torch.Generator,
         *,
         remove_large: bool,
-    ) -> None:
-        """Clone, split and prune; statistics start anew. If nothing would be left, nothing is removed."""
-        c, splats = self.config, parameters.trained()
+    ) -> tuple[Tensor, Splats, Tensor]:
+        """Clone, split and prune: which splats stay, [M] bool; the new ones; the rows that these came from, [A] int64.
+
+        If nothing would be left, nothing is removed.
+        """
+        c = self.config
         asks = self._densified(self.gradient / self.seen.clamp_min(1))
-        large = splats.log_scales.amax(1).exp() > c.split_size * self.extent
-        clones = splats.rows(torch.nonzero(asks & ~large).view(-1))
-        parts = split(splats.rows(torch.nonzero(asks & large).view(-1)), chance)
+        sizes = drawn.log_scales.amax(1)
+        large = sizes.exp() > c.split_size * self.extent
+        cloned, divided = (torch.nonzero(asks & some).view(-1) for some in (~large, large))
+        parts = split(splats.rows(divided), chance, drawn.rows(divided))
+        clones = splats.rows(cloned)
         added = Splats(**{name: torch.cat([t, getattr(parts, name)]) for name, t in vars(clones).items()})
-        kept = ~(asks & large) & ~self._superfluous(splats, remove_large)
-        added = added.rows(torch.nonzero(~self._superfluous(added, remove_large)).view(-1))
-        if kept.any() or len(added):
-            replace_splats(parameters, optimizer, kept, added)
-        self.gradient = self.gradient.new_zeros(len(parameters))
-        self.seen = self.seen.new_zeros(len(parameters))
+        origins = torch.cat([cloned, divided.repeat(SPLIT_INTO)])
+        new_sizes = sizes[origins]
+        new_sizes[len(cloned) :] -= LOG_SHRINK
+        opacities = drawn.opacity_logits.sigmoid()
+        kept = ~(asks & large) & ~self._superfluous(opacities, sizes, remove_large)
+        rows = torch.nonzero(~self._superfluous(opacities[origins], new_sizes, remove_large)).view(-1)
+        if not kept.any() and not len(rows):
+            kept = torch.ones_like(kept)
+        return kept, added.rows(rows), origins[rows]
 
     def _densified(self, gradient: Tensor) -> Tensor:
         """[M] bool: splats with a gradient [M] above the threshold; the strongest, if all would be too many."""
@@ -120,22 +137,24 @@ class DensityControl:
             asks[strongest[:room]] = True
         return asks
 
-    def _superfluous(self, splats: Splats, remove_large: bool) -> Tensor:
-        """[M] bool: too transparent, or (if asked) too large."""
-        removed = splats.opacity_logits.sigmoid() < self.config.prune_opacity
+    def _superfluous(self, opacities: Tensor, sizes: Tensor, remove_large: bool) -> Tensor:
+        """[M] bool: too transparent, or (if asked) too large; `sizes` [M] are logs of the largest scale."""
+        removed = opacities < self.config.prune_opacity
         if remove_large:
-            removed |= splats.log_scales.amax(1).exp() > self.config.prune_size * self.extent
+            removed |= sizes.exp() > self.config.prune_size * self.extent
         return removed
 
 
-def split(splats: Splats, chance: torch.Generator) -> Splats:
-    """Smaller splats in place of each, at random places within it: SPLIT_INTO blocks of M, one after the other."""
+def split(splats: Splats, chance: torch.Generator, drawn: Splats | None = None) -> Splats:
+    """Smaller splats in place of each, at random places within it: SPLIT_INTO blocks of M, one after the other.
+
+    `drawn`: the splats as they are drawn, where that is not as they are: where the places are.
+    """
     rows = torch.arange(len(splats), device=splats.means.device).repeat(SPLIT_INTO)
-    parts = splats.rows(rows)
+    parts, shapes = splats.rows(rows), (drawn or splats).rows(rows)
     within = torch.randn(parts.means.shape, generator=chance, device=parts.means.device)
-    offset = rotate(parts.quaternions, within * parts.log_scales.exp())
-    shrunk = parts.log_scales - torch.log(torch.tensor(SPLIT_SHRINK)).item()
-    return replace(parts, means=parts.means + offset, log_scales=shrunk)
+    offset = rotate(shapes.quaternions, within * shapes.log_scales.exp())
+    return replace(parts, means=parts.means + offset, log_scales=parts.log_scales - LOG_SHRINK)
 
 
 def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:  # [M, 4] w-x-y-z, [M, 3] -> [M, 3]

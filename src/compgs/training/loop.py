@@ -1,7 +1,7 @@
-"""What training is, whatever is trained: views in turn, steps to the end, progress, checkpoints, a stop at any time."""
+"""What training is, whatever is trained: steps to the end, progress, checkpoints, a stop at any time."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -10,16 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from compgs.cameras import Camera
 from compgs.config import Config, TrainingConfig, check_config, load_config
 from compgs.errors import ConfigError, TrainingError
+from compgs.gaussians import Gaussians
 from compgs.interrupt import held_back
-from compgs.losses import Target
-from compgs.scene.views import View
+from compgs.losses import Target, exposed
+from compgs.render import RasterResult, RasterSettings, Renderable
+from compgs.tensors.rasterize import rasterize
 from compgs.training.allocation import freed_memory_kept
 from compgs.training.checkpoint import CHECKPOINT_NAME
+from compgs.training.profile import StepProfile
 
 REPORT_EVERY = 10  # steps between two status reports
-KEPT_BYTES = 8 << 30  # of photographs on a GPU, 3 bytes a pixel
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it may look at every primitive
 
 
@@ -43,8 +46,39 @@ class TrainingStatus:
 @dataclass(frozen=True)
 class StepResult:
     loss: Tensor  # []; a tensor, so that the CPU waits for the GPU only when somebody reads it
-    image: Tensor  # [H, W, 3]
-    view: View
+    image: Tensor  # [H, W, 3] rendered
+    photograph: Target  # what it was compared with
+
+
+class Run:
+    """How a training is carried out, whatever is trained: nothing of it is a setting of what comes out."""
+
+    def __init__(
+        self,
+        method: str,  # as it is called in the registry; checkpoints say it
+        *,
+        output: str | Path | None = None,  # folder for checkpoints
+        resume: bool = False,
+        on_progress: Callable[[TrainingStatus], None] | None = None,
+        device: str | torch.device | None = None,  # None: CUDA where there is one
+        profile: StepProfile | None = None,
+        watch: "Watch | None" = None,
+    ) -> None:
+        """Raises ConfigError if there is no folder to resume from."""
+        if output is None and resume:
+            raise ConfigError("resume needs an output folder: the one of the run to continue")
+        self.method = method
+        self.checkpoint = None if output is None else Path(output) / CHECKPOINT_NAME
+        self.resume = resume
+        self.on_progress = on_progress
+        self.device = chosen_device(device)
+        self.profile = profile
+        self.watch = watch
+
+    @property
+    def earlier(self) -> Path | None:
+        """The checkpoint to go on from, if that is asked for."""
+        return self.checkpoint if self.resume else None
 
 
 class Trains(Protocol):
@@ -65,9 +99,27 @@ class Trains(Protocol):
 
     def estimated_bytes(self) -> int: ...
 
+    def snapshot(self) -> Renderable:
+        """The scene of now, to be rendered: a copy that further steps do not change, taken without any chance."""
+        ...
+
     def finish(self) -> None: ...
 
     def save(self, path: Path) -> None: ...
+
+
+# Called between any two steps, for whoever wants to look at the scene as it grows.
+Watch = Callable[[Trains], None]
+
+
+def rasterize_step(
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, *, watched: bool
+) -> RasterResult:
+    """A training view. Where growth watches the step, the gradients by the 2D means are kept: it goes by them."""
+    rendered = rasterize(gaussians, camera, settings)
+    if watched:
+        rendered.means2d.retain_grad()
+    return rendered
 
 
 def chosen_device(device: str | torch.device | None) -> torch.device:
@@ -88,36 +140,6 @@ def chosen_config(config: Config | None, preset: str | None) -> Config:
     chosen = config or load_config(preset or "default")
     check_config(chosen)
     return chosen
-
-
-def checkpoint_path(output: str | Path | None, *, resume: bool) -> Path | None:
-    """In the run's folder, if there is one. Raises ConfigError if there is none to resume from."""
-    if output is None and resume:
-        raise ConfigError("resume needs an output folder: the one of the run to continue")
-    return None if output is None else Path(output) / CHECKPOINT_NAME
-
-
-def kept_target(
-    targets: dict[int, Target], view_index: int, views: Sequence[View], device: torch.device
-) -> Target:
-    """The photograph of a view. On the CPU it shares the memory of the view's image, which the scene keeps or reads
-    again; it is copied to a GPU once and kept there while there is room.
-    """
-    if device.type == "cpu":
-        return Target.from_image(views[view_index].image)
-    if view_index not in targets:
-        target = Target.from_image(views[view_index].image, device)
-        while targets and sum(t.image.numel() for t in targets.values()) + target.image.numel() > KEPT_BYTES:
-            del targets[next(iter(targets))]
-        targets[view_index] = target
-    return targets[view_index]
-
-
-def next_view(order: list[int], views: int, shuffle: np.random.Generator) -> int:
-    """Every view once in random order, then again. `order`: the views to come in this round, taken from its end."""
-    if not order:
-        order.extend(int(i) for i in shuffle.permutation(views))
-    return order.pop()
 
 
 def diverged(step: int, what: str, value: float) -> TrainingError:
@@ -194,9 +216,10 @@ def run_to_end(
     config: TrainingConfig,
     path: Path | None,
     on_progress: Callable[[TrainingStatus], None] | None,
+    watch: Watch | None = None,
 ) -> None:
     """All remaining steps; checkpoints at `path` as `Saving` says. Progress is reported now and then, and right after
-    each checkpoint."""
+    each checkpoint. What `watch` does takes its time, and changes nothing."""
     saving, pace, estimate = Saving(trainer, path, config.checkpoint_minutes), Pace(), 0
     try:
         while trainer.step < config.steps:
@@ -215,6 +238,8 @@ def run_to_end(
                 if trainer.step % ESTIMATE_EVERY == 0 or not estimate:
                     estimate = trainer.estimated_bytes()
                 on_progress(_status(trainer, config.steps, result, estimate, seconds))
+            if watch:
+                watch(trainer)
         trainer.finish()
     except KeyboardInterrupt:
         saving.stopped()
@@ -223,8 +248,10 @@ def run_to_end(
 
 
 def _status(trainer: Trains, steps: int, result: StepResult, estimate: int, pace: float) -> TrainingStatus:
-    photograph = result.image.new_tensor(result.view.image) / 255.0
-    error = float(((result.image.clamp(0, 1) - photograph) ** 2).mean())
+    photograph, counted = result.photograph.image.to(result.image.dtype) / 255.0, result.photograph.counted
+    image = exposed(result.image, result.photograph.exposure).detach()
+    squares = (image.clamp(0, 1) - photograph) ** 2
+    error = float((squares if counted is None else squares[counted]).mean())
     psnr = -10.0 * float(np.log10(max(error, 1e-10)))
     return TrainingStatus(
         step=trainer.step,

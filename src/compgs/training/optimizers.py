@@ -6,10 +6,11 @@ from functools import partial
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor, nn
 
 from compgs.config import TrainingConfig
+from compgs.numerics.compiled import njit
 from compgs.trained_model import TrainedModel
 
 HEAD_GROUPS = ("geometry", "appearance", "translation", "covariance", "opacity", "color")
@@ -130,7 +131,7 @@ def adam_rows(
     parameter.index_add_(0, rows, m / correction1 / denominator, alpha=-group["lr"])
 
 
-@njit(parallel=True, fastmath={"contract", "nsz", "arcp"}, error_model="numpy", cache=True)
+@njit(parallel=True, fastmath={"contract", "nsz", "arcp"}, error_model="numpy")
 def _adam_rows(rows, parameter, gradient, first, second, numbers):
     """`adam_rows` on the CPU in one pass. numbers: rate and epsilon with the bias corrections in them, 1 - betas."""
     for chunk in prange(ROW_CHUNKS):

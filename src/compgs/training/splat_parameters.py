@@ -1,15 +1,17 @@
 """The trainable splats of plain 3DGS, how they begin, and the optimizer over them (Kerbl et al. 2023, Sec. 5 and 6)."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from compgs.config import SplatConfig
-from compgs.model.spherical_harmonics import coefficients, dc_from_color
-from compgs.model.splats import Splats
+from compgs.numerics.nearest import nearest
 from compgs.scene.views import Points
-from compgs.training.optimizers import ADAM_EPSILON
+from compgs.tensors.spherical_harmonics import coefficients, dc_from_color
+from compgs.tensors.splats import Splats
+from compgs.training.optimizers import ADAM_EPSILON, replace_parameter
 
 NEIGHBOURS = 3  # of a point: their mean distance is the size of its splat
 SMALLEST_SCALE = 1e-7**0.5  # world units, of splats whose neighbours are in the same place (3DGS)
@@ -44,7 +46,7 @@ def initial_splats(points: Points, config: SplatConfig) -> Splats:
     """Every point becomes a round splat of its color, as large as the distance to its neighbours."""
     n = len(points)
     neighbours = min(NEIGHBOURS + 1, n)
-    distances = cKDTree(points.positions).query(points.positions, k=neighbours)[0].reshape(n, neighbours)
+    distances, _ = nearest(points.positions, points.positions, neighbours)
     spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(n)
     spread = np.maximum(spread, SMALLEST_SCALE)
     opacity = torch.full((n,), config.initial_opacity)
@@ -87,32 +89,47 @@ def replace_splats(
 ) -> None:
     """Keep some splats, [M] bool, and append others, in the parameters and in Adam's moments (zero for new ones)."""
     for name, new in vars(added).items():
-        old = getattr(parameters, name)
-        _replace(parameters, optimizer, name, torch.cat([old.detach()[kept], new]))
-        state = optimizer.state.get(getattr(parameters, name))
-        if state:
-            for moment in ("exp_avg", "exp_avg_sq"):
-                state[moment] = torch.cat([state[moment][kept], torch.zeros_like(new)])
+        _replace_rows(parameters, getattr(parameters, name), optimizer, kept, new)
+
+
+@torch.no_grad()
+def replace_rows_of(
+    module: nn.Module, name: str, optimizer: torch.optim.Adam, kept: Tensor, origins: Tensor
+) -> None:
+    """The same for a parameter or buffer of a module with a row for each splat: new rows are those of the splats that
+    the new ones came from, `origins` [A] int64.
+    """
+    old = getattr(module, name)
+    new = old.detach()[origins]
+    if isinstance(old, nn.Parameter):
+        _replace_rows(module, old, optimizer, kept, new)
+    else:
+        setattr(module, name, torch.cat([old[kept], new]))
 
 
 @torch.no_grad()
 def reset_opacities(parameters: SplatParameters, optimizer: torch.optim.Adam, opacity: float) -> None:
     """Opacities above `opacity` fall to it: those that the views need come back, the others are pruned."""
     highest = torch.logit(torch.tensor(opacity)).item()
-    _replace(parameters, optimizer, "opacity_logits", parameters.opacity_logits.clamp_max(highest))
-    state = optimizer.state.get(parameters.opacity_logits)
-    if state:
-        for moment in ("exp_avg", "exp_avg_sq"):
-            state[moment].zero_()
+    replace_parameter(
+        parameters, optimizer, parameters.opacity_logits, lambda x: x.clamp_max(highest), torch.zeros_like
+    )
 
 
-def _replace(parameters: SplatParameters, optimizer: torch.optim.Adam, name: str, value: Tensor) -> None:
-    """A parameter's new value, which may have other rows; Adam's state goes along as it is."""
-    old, new = getattr(parameters, name), nn.Parameter(value)
-    setattr(parameters, name, new)
-    for group in optimizer.param_groups:
-        if group["name"] == name:
-            group["params"] = [new]
-    state = optimizer.state.pop(old, None)
-    if state:
-        optimizer.state[new] = state
+def _replace_rows(
+    module: nn.Module, old: nn.Parameter, optimizer: torch.optim.Adam, kept: Tensor, new: Tensor
+) -> None:
+    replace_parameter(
+        module,
+        optimizer,
+        old,
+        lambda x: torch.cat([x[kept], new]),
+        lambda moment: torch.cat([moment[kept], torch.zeros_like(new)]),
+    )
+
+
+def of_degree(splats: Splats, degree: int) -> Splats:
+    """With harmonics up to `degree`: those above it are left out, missing ones are zero."""
+    count = coefficients(degree) - 1
+    missing = splats.rest.new_zeros(len(splats), max(0, count - splats.rest.shape[1]), 3)
+    return replace(splats, rest=torch.cat([splats.rest[:, :count], missing], 1))

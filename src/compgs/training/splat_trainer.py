@@ -3,27 +3,28 @@
     splats ──activate, harmonics──► Gaussians ──rasterize──► image ──(1 - w) L1 + w (1 - SSIM)──► loss
 
 Same scenes, views, rasterizer, loss and evaluation as the hybrid method's (`training/trainer.py`); no networks, no
-quantization, no rate.
+quantization, no rate. Methods that compress splats build on it by `training/hooks.py`.
 """
 
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
-from compgs.errors import ConfigError
+from compgs.devices import placed
 from compgs.gaussians import Gaussians
-from compgs.losses import Target, photometric_loss
-from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
-from compgs.render import RasterResult, RasterSettings, rasterize, visible_mask
+from compgs.losses import photometric_loss
+from compgs.model.splats import SplatModel
+from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
+from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
+from compgs.tensors.visibility import visible_mask
 from compgs.training.checkpoint import (
     check_same_run,
     optimizer_tensors,
@@ -33,27 +34,41 @@ from compgs.training.checkpoint import (
     write_checkpoint_file,
 )
 from compgs.training.densification import DensityControl, densify_schedule
+from compgs.training.hooks import Drawn, Hooks, hook_state, parameter_groups, restore_hooks
 from compgs.training.loop import (
+    Run,
     StepResult,
     TrainingStatus,
-    checkpoint_path,
+    Watch,
     chosen_config,
-    chosen_device,
-    kept_target,
-    next_view,
+    rasterize_step,
     run_to_end,
 )
 from compgs.training.optimizers import exponential_decay, set_learning_rates
 from compgs.training.profile import StepProfile
+from compgs.training.restoring import (
+    check_moments,
+    check_step,
+    check_tensor,
+    finite,
+    restore_chance,
+    restore_statistics,
+    restoring,
+)
 from compgs.training.seen_points import check_points_seen
 from compgs.training.splat_parameters import (
     SplatParameters,
     initial_splats,
     make_splat_optimizer,
+    of_degree,
+    replace_rows_of,
+    replace_splats,
     reset_opacities,
 )
+from compgs.training.views_in_turn import ViewsInTurn
 
 METHOD = "3dgs"
+HOOKS = "hooks/"  # before the names of the hooks' parameters, in checkpoints and in the optimizer
 # Numbers of a splat in a .ply file of degree 0: position, normal, color, opacity, scales, rotation.
 STORED_NUMBERS = 3 + 3 + 3 + 1 + 3 + 4
 
@@ -75,18 +90,11 @@ def train_splats(
 
     Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
     """
+    from compgs.training.phases import Phase, train_phases
+
     config = chosen_config(config, preset)
-    scene = as_scene(scene)
-    chosen = chosen_device(device)
-    path = checkpoint_path(output, resume=resume)
-    if resume and path:
-        trainer = SplatTrainer.resumed(scene, path, config, chosen)
-    else:
-        trainer = SplatTrainer(scene, config, chosen)
-    if profile is not None:
-        profile.watch(trainer, PARTS, stations)
-    trainer.run(path, on_progress)
-    return SplatModel(trainer.parameters.trained(), scene.background, trainer.world_offset)
+    run = Run(METHOD, output=output, resume=resume, on_progress=on_progress, device=device, profile=profile)
+    return train_phases(as_scene(scene), (Phase(config),), run).model()
 
 
 class SplatTrainer:
@@ -100,25 +108,47 @@ class SplatTrainer:
         scene: Scene,
         config: Config,
         device: torch.device,
-        splats: Splats | None = None,
-        offset: tuple[float, float, float] | None = None,  # world units, of these splats; None: the scene's
+        start: SplatModel | None = None,  # trained splats to begin with; None: the scene's points
+        hooks: Hooks | None = None,
+        *,
+        phase: int = 0,  # of the run, and the method whose run it is: checkpoints say them
+        method: str = METHOD,
     ) -> None:
-        if not scene.train_views:
-            raise ConfigError(f"{scene.name}: no training views are left after holding out the test views")
-        self.world_offset = world_offset(scene) if offset is None else offset
+        self.views = ViewsInTurn(scene, device, config.training.seed + 2, exposure=config.training.exposure)
+        self.world_offset = world_offset(scene) if start is None else start.world_offset
         scene = self.scene = local_scene(scene, self.world_offset)
         self.config = config
         self.device = device
-        self.parameters = SplatParameters((splats or initial_splats(scene.points, config.splats)).to(device))
+        self.phase = phase
+        self.method = method
+        self.hooks = (hooks or Hooks()).to(device)
+        splats = (
+            initial_splats(scene.points, config.splats)
+            if start is None
+            else of_degree(Splats.of(start.splats), config.splats.harmonics)
+        )
+        self.parameters = SplatParameters(splats.to(device))
         self.optimizer = make_splat_optimizer(self.parameters, config.splats, scene.extent)
         self.schedule = densify_schedule(config.splats, config.training.steps, len(scene.train_views))
         self.control = DensityControl(config.splats, scene.extent, len(self.parameters), device)
         self.chance = torch.Generator(device).manual_seed(config.training.seed + 1)  # of splits
-        self.shuffle = np.random.default_rng(config.training.seed + 2)
-        self.order: list[int] = []
-        self.targets: dict[int, Target] = {}
         self.settings = RasterSettings(background=scene.background)
         self.step = 0
+
+    def begin(self) -> None:
+        """Let the hooks make what depends on the splats: before the first step of a run that is not resumed."""
+        self.hooks.begin(self)
+        self.train_hooks()
+
+    def train_hooks(self) -> None:
+        """Add the hooks' parameters to the optimizer, those that are not in it: after a hook made new ones."""
+        there = {group["name"] for group in self.optimizer.param_groups}
+        self.hooks.to(self.device)
+        for name, parameters in parameter_groups(self.hooks).items():
+            if HOOKS + name not in there:
+                rates = self.hooks.rates[name]
+                group = {"name": HOOKS + name, "params": parameters, "lr": rates[0], "rates": rates}
+                self.optimizer.add_param_group(group)
 
     @property
     def primitives(self) -> int:
@@ -127,25 +157,35 @@ class SplatTrainer:
     def degree(self) -> int:
         """Of the harmonics in use: it rises with the run, so that colors settle before their variation."""
         s, steps = self.config.splats, self.config.training.steps
-        every = max(1, round(s.harmonics_every * steps))
-        return min(s.harmonics, self.step // every)
+        every = round(s.harmonics_every * steps)
+        return min(s.harmonics, self.step // max(1, every)) if s.harmonics_every > 0 else s.harmonics
 
     # one step ------------------------------------------------------------------------------------------------------
 
     def train_step(self) -> StepResult:
         """Activate, rasterize, compare, pull; then control density."""
-        index = next_view(self.order, len(self.scene.train_views), self.shuffle)
-        view = self.scene.train_views[index]
-        splats = self.parameters.splats()
-        gaussians = self.activate(splats, self.inside(splats, view.camera), view.camera)
-        rendered = self.rasterize(gaussians, view.camera)
-        loss = self.compare(rendered, self.target(index))
-        self.backward(loss, rendered, gaussians)
+        drawn = self.draw(self.views.next())
+        loss = self.compare(drawn)
+        self.backward(loss, drawn.rendered, drawn.gaussians)
         self.update()
-        self.observe(rendered, view.camera)
+        self.observe(drawn.rendered, drawn.camera)
         self.step += 1
         self.control_density()
-        return StepResult(loss.detach(), rendered.image.detach(), view)
+        self.hooks.after_step(self)
+        return StepResult(loss.detach(), drawn.rendered.image.detach(), drawn.photograph)
+
+    @property
+    def progress(self) -> float:
+        """Of this phase of the run, 0 to 1."""
+        return self.step / self.config.training.steps
+
+    def draw(self, index: int) -> Drawn:
+        """A training view as the hooks want it looked at."""
+        photograph = self.views.photograph(index)
+        camera, photograph = self.hooks.view(self.scene.train_views[index].camera, photograph, self)
+        splats = self.hooks.transform(self.parameters.splats(), self)
+        gaussians = self.activate(splats, self.inside(splats, camera), camera)
+        return Drawn(camera, photograph, splats, gaussians, self.rasterize(gaussians, camera))
 
     def inside(self, splats: Splats, camera: Camera) -> Tensor:
         """[M] bool: splats that may be in the image."""
@@ -155,22 +195,22 @@ class SplatTrainer:
         return splat_gaussians(splats, camera, self.degree(), inside)
 
     def rasterize(self, gaussians: Gaussians, camera: Camera) -> RasterResult:
-        rendered = rasterize(gaussians, camera, self.settings)
-        if self.schedule.active(self.step):
-            rendered.means2d.retain_grad()
-        return rendered
+        return rasterize_step(gaussians, camera, self.settings, watched=self.schedule.active(self.step))
 
-    def compare(self, rendered: RasterResult, target: Target) -> Tensor:
-        return photometric_loss(rendered.image, target, self.config.training.ssim_weight)
+    def compare(self, drawn: Drawn) -> Tensor:
+        loss = photometric_loss(drawn.rendered.image, drawn.photograph, self.config.training.ssim_weight)
+        added = self.hooks.loss(drawn, self)
+        return loss if added is None else loss + added
 
     def backward(self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians) -> None:
         """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
         loss.backward()
 
     def update(self) -> None:
-        set_learning_rates(self.optimizer, self.step / self.config.training.steps, exponential_decay)
+        set_learning_rates(self.optimizer, self.progress, exponential_decay)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
+        self.views.learn(self.progress)
 
     def observe(self, rendered: RasterResult, camera: Camera) -> None:
         if self.schedule.active(self.step) and rendered.means2d.grad is not None:
@@ -179,68 +219,136 @@ class SplatTrainer:
     def control_density(self) -> None:
         """What the schedule asks for after so many steps."""
         if self.schedule.due(self.step):
-            self.control.act(
-                self.parameters,
-                self.optimizer,
-                self.chance,
-                remove_large=self.step > self.schedule.reset_every,
+            large = self.step > self.schedule.reset_every
+            kept, added, origins = self.control.chosen(
+                self.parameters.trained(), self.as_drawn(), self.chance, remove_large=large
             )
+            self.replace(kept, added, origins)
+            self.control.forget(len(self.parameters))
+            self.hooks.densified(self)
         if self.schedule.reset_due(self.step):
             reset_opacities(self.parameters, self.optimizer, self.config.splats.reset_opacity)
 
-    def target(self, view_index: int) -> Target:
-        return kept_target(self.targets, view_index, self.scene.train_views, self.device)
+    @torch.no_grad()
+    def as_drawn(self) -> Splats:
+        """The splats as the hooks' `transform` leaves them, without gradients."""
+        splats = self.hooks.transform(self.parameters.splats(), self)
+        return Splats(**{name: value.detach() for name, value in vars(splats).items()})
+
+    def keep(self, kept: Tensor) -> None:
+        """Remove the splats outside of `kept` [M] bool; all that belongs to them goes, too."""
+        none = torch.zeros(0, dtype=torch.int64, device=self.device)
+        self.replace(kept, self.parameters.trained().rows(none), none)
+        self.control.keep(kept)
+
+    def replace(self, kept: Tensor, added: Splats, origins: Tensor) -> None:
+        """Keep some splats, [M] bool, and append others, which came from those of the rows `origins` [A] int64."""
+        replace_splats(self.parameters, self.optimizer, kept, added)
+        for name in self.hooks.per_splat:
+            replace_rows_of(self.hooks, name, self.optimizer, kept, origins)
 
     # the run -------------------------------------------------------------------------------------------------------
 
-    def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
+    def run(
+        self,
+        path: Path | None,
+        on_progress: Callable[[TrainingStatus], None] | None,
+        watch: Watch | None = None,
+    ) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         check_points_seen(self.scene, self.settings.near_plane)
-        run_to_end(self, self.config.training, path, on_progress)
+        run_to_end(self, self.config.training, path, on_progress, watch)
 
     def estimated_bytes(self) -> int:
-        """Size of the .ply file if it were written now, without its header."""
+        """Size of the method's file if it were written now; of a .ply file without its header."""
+        known = self.hooks.estimated_bytes(self)
+        if known is not None:
+            return known
         return 4 * len(self.parameters) * (STORED_NUMBERS + self.parameters.rest[0].numel())
 
     def finish(self) -> None:
-        """Nothing is left to do: the file holds the splats as they are."""
+        """Plain 3DGS has nothing left to do: the file holds the splats as they are."""
+        self.hooks.finish(self)
+
+    def snapshot(self) -> SplatModel:
+        """Before any `transform`, for which a hook may draw random numbers."""
+        return self.model()
+
+    def model(self) -> SplatModel:
+        """The splats of now, before any `transform`."""
+        arrays = self.parameters.trained().arrays(self.world_offset)
+        return placed(SplatModel(arrays, self.scene.background), self.device)
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
     def save(self, path: Path) -> None:
         tensors = {f"model/{name}": p for name, p in vars(self.parameters.trained()).items()}
-        moments = optimizer_tensors(self.parameters, self.optimizer)
+        moments = optimizer_tensors(self.named_parameters(), self.optimizer)
         tensors |= {f"optimizer/{name}": value for name, value in moments.items()}
         tensors |= {f"extra/control/{n}": getattr(self.control, n) for n in DensityControl.STATISTICS}
+        tensors |= {f"extra/{HOOKS}{name}": value for name, value in hook_state(self.hooks).items()}
+        tensors |= {f"extra/{name}": value for name, value in self.views.tensors().items()}
         tensors["extra/chance"] = self.chance.get_state()
         state = {
             "step": self.step,
-            "order": self.order,
-            "shuffle": self.shuffle.bit_generator.state,
-            "views": [view.name for view in self.scene.train_views],
+            "phase": self.phase,
+            **self.views.state(),
             "world_offset": self.world_offset,
         }
         metadata = {"config": json.dumps(self.config.to_dict()), "state": json.dumps(state)}
-        write_checkpoint_file(path, METHOD, tensors, metadata)
+        write_checkpoint_file(path, self.method, tensors, metadata)
+
+    def named_parameters(self) -> dict[str, nn.Parameter]:
+        """All that is trained."""
+        own = {HOOKS + name: parameter for name, parameter in self.hooks.named_parameters()}
+        return {**dict(self.parameters.named_parameters()), **own}
 
     @classmethod
-    def resumed(cls, scene: Scene, path: Path, config: Config, device: torch.device) -> "SplatTrainer":
+    def resumed(
+        cls,
+        scene: Scene,
+        path: Path,
+        config: Config,
+        device: torch.device,
+        hooks: Hooks | None = None,
+        *,
+        phase: int = 0,
+        method: str = METHOD,
+    ) -> "SplatTrainer":
         """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
-        tensors, metadata = read_checkpoint_file(path, METHOD)
-        state = json.loads(metadata["state"])
-        saved = config_from_dict(json.loads(metadata["config"]), str(path))
-        check_same_run(saved, config, state["views"], scene)
-        parts = tensors_by_kind(tensors)
-        offset = tuple(state.get("world_offset", (0.0, 0.0, 0.0)))  # older checkpoints have none
-        trainer = cls(scene, config, device, Splats(**parts["model"]), offset)
-        restore_optimizer(trainer.parameters, trainer.optimizer, parts["optimizer"])
-        for name in DensityControl.STATISTICS:
-            setattr(trainer.control, name, parts["extra"][f"control/{name}"].to(device))
-        trainer.chance.set_state(parts["extra"]["chance"])
-        trainer.shuffle.bit_generator.state = state["shuffle"]
-        trainer.order = state["order"]
-        trainer.step = state["step"]
+        tensors, metadata = read_checkpoint_file(path, method)
+        with restoring(path):
+            state = json.loads(metadata["state"])
+            saved = config_from_dict(json.loads(metadata["config"]), str(path), type(config))
+            check_same_run(saved, config, state["views"], scene)
+            check_step(state, config.training.steps)
+            parts = tensors_by_kind(tensors)
+            x, y, z = finite(state.get("world_offset", [0.0] * 3), 3, "world_offset")  # older ones have none
+            start = SplatModel(checked_splats(parts["model"]).arrays((x, y, z)), scene.background)
+        trainer = cls(scene, config, device, start, hooks, phase=phase, method=method)
+        with restoring(path):
+            extra = parts["extra"]
+            own = {name.removeprefix(HOOKS): v for name, v in extra.items() if name.startswith(HOOKS)}
+            restore_hooks(trainer.hooks, own)
+            trainer.train_hooks()
+            check_moments(parts["optimizer"], trainer.named_parameters())
+            restore_optimizer(trainer.named_parameters(), trainer.optimizer, parts["optimizer"])
+            restore_statistics(trainer.control, DensityControl.STATISTICS, extra)
+            restore_chance(trainer.chance, extra)
+            trainer.views.restore(state, extra)
+            trainer.step = state["step"]
         return trainer
+
+
+def checked_splats(tensors: dict[str, Tensor]) -> Splats:
+    """Of a checkpoint. Raises ValueError and the like for what does not belong together."""
+    count, harmonics = len(tensors["means"]), tensors["rest"].shape[1]
+    shapes = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_logits": (), "dc": (3,)}
+    for name, shape in {**shapes, "rest": (harmonics, 3)}.items():
+        check_tensor(tensors[name], (count, *shape), torch.float32, name)
+    if harmonics + 1 not in (1, 4, 9, 16):
+        raise ValueError(f"{harmonics} harmonics are those of no degree")
+    return Splats(**tensors)
 
 
 # What a profile calls the parts of a step.

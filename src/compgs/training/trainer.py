@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +12,7 @@ from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.entropy import Quantized
 from compgs.entropy.quantization import UniformNoise
-from compgs.errors import ConfigError, TrainingError
+from compgs.errors import TrainingError
 from compgs.gaussians import Gaussians
 from compgs.losses import (
     Target,
@@ -24,11 +23,13 @@ from compgs.losses import (
     scale_regularizer,
     scale_unit,
 )
-from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
-from compgs.render import RasterResult, RasterSettings, rasterize, visible_mask
+from compgs.model.hybrid_model import HybridModel
+from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
-from compgs.scene.views import Scene, View
+from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
+from compgs.tensors.prediction import Prediction, camera_center, choosing_pays, predict
+from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
 from compgs.training.checkpoint import (
     Checkpoint,
@@ -46,22 +47,24 @@ from compgs.training.file_size import fixed_bytes, latent_bytes
 from compgs.training.importance import LOOKED_AT, PRUNED_BY, missed, spread, view_contributions, worth_keeping
 from compgs.training.initial import initial_model
 from compgs.training.loop import (
+    Run,
     StepResult,
     TrainingStatus,
-    checkpoint_path,
+    Watch,
     chosen_config,
-    chosen_device,
     diverged,
-    kept_target,
-    next_view,
+    rasterize_step,
     run_to_end,
 )
 from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rates, step_rows
 from compgs.training.profile import StepProfile
 from compgs.training.rate_control import RateState
+from compgs.training.restoring import check_tensor, restore_chance, restore_statistics, restoring
 from compgs.training.seen_points import check_points_seen
 from compgs.training.target_size import TargetSize, pruned_share
+from compgs.training.views_in_turn import ViewsInTurn
 
+METHOD = "compgs"
 # With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
 FEW_DRAWN = 0.1
 
@@ -87,16 +90,19 @@ def train(
     Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
     """
     config = chosen_config(config, preset)
-    scene = as_scene(scene)
-    chosen = chosen_device(device)
-    path = checkpoint_path(output, resume=resume)
-    if resume and path:
-        trainer = Trainer.resumed(scene, load_checkpoint(path), config, chosen)
+    run = Run(METHOD, output=output, resume=resume, on_progress=on_progress, device=device, profile=profile)
+    return train_hybrid(as_scene(scene), config, run)
+
+
+def train_hybrid(scene: Scene, config: Config, run: Run) -> TrainedModel:
+    """Train a scene, as `train` does. Raises as it does."""
+    if run.earlier:
+        trainer = Trainer.resumed(scene, run.earlier, config, run.device)
     else:
-        trainer = Trainer(scene, config, chosen)
-    if profile is not None:
-        profile.watch(trainer, PARTS, stations)
-    trainer.run(path, on_progress)
+        trainer = Trainer(scene, config, run.device)
+    if run.profile is not None:
+        run.profile.watch(trainer, PARTS, stations)
+    trainer.run(run.checkpoint, run.on_progress, run.watch)
     return trainer.model
 
 
@@ -108,9 +114,8 @@ class Trainer:
     def __init__(
         self, scene: Scene, config: Config, device: torch.device, model: TrainedModel | None = None
     ) -> None:
-        if not scene.train_views:
-            raise ConfigError(f"{scene.name}: no training views are left after holding out the test views")
         t, views = config.training, len(scene.train_views)
+        self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure)
         self.config = config
         self.device = device
         self.model = (model or initial_model(scene, config)).to(device)
@@ -119,11 +124,8 @@ class Trainer:
         self.schedule = make_schedule(config.control, t.steps, views)
         self.control = AdaptiveControl(config, self.schedule, self.model.anchors, device)
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
-        self.shuffle = np.random.default_rng(t.seed + 2)
-        self.noise = UniformNoise(t.seed + 3, self.shuffle, device)
+        self.noise = UniformNoise(t.seed + 3, self.views.chance, device)
         self.reference_rates: Tensor | None = None  # [reference_dim], once the channels differ in it
-        self.order: list[int] = []
-        self.targets: dict[int, Target] = {}
         self.settings = RasterSettings(background=scene.background)
         self.left_out = share_left_out(views, t.left_out)
         self.step = 0
@@ -141,23 +143,21 @@ class Trainer:
 
     def train_step(self) -> StepResult:
         """Quantize, predict, rasterize, compare, pull (the paper's Fig. 2 from left to right)."""
-        index = next_view(self.order, len(self.scene.train_views), self.shuffle)
-        view = self.scene.train_views[index]
-        rows = self.visible_anchors(view.camera)
+        index = self.views.next()
+        camera, photograph = self.scene.train_views[index].camera, self.views.photograph(index)
+        rows = self.visible_anchors(camera)
         if len(rows) == 0:
-            return self.skip(view)
+            return self.skip(photograph)
         latents = self.quantize(rows)
-        prediction, gaussians = self.predict_some(latents, rows, view.camera)
-        rendered = self.rasterize(gaussians, view.camera)
-        distortion = self.compare(rendered, self.target(index)) + self.regularize(
-            prediction, gaussians, view.camera
-        )
+        prediction, gaussians = self.predict_some(latents, rows, camera)
+        rendered = self.rasterize(gaussians, camera)
+        distortion = self.compare(rendered, photograph) + self.regularize(prediction, gaussians, camera)
         loss = self.add_rate(distortion, latents)
         self.backward(loss, rendered, gaussians, latents)
         self.update(rows)
-        self.observe(rows, prediction, rendered, view.camera)
+        self.observe(rows, prediction, rendered, camera)
         self.finish_step()
-        return StepResult(loss.detach(), rendered.image.detach(), view)
+        return StepResult(loss.detach(), rendered.image.detach(), photograph)
 
     @property
     def progress(self) -> float:
@@ -207,10 +207,7 @@ class Trainer:
         )
 
     def rasterize(self, gaussians: Gaussians, camera: Camera) -> RasterResult:
-        rendered = rasterize(gaussians, camera, self.settings)
-        if self.schedule.active(self.step):
-            rendered.means2d.retain_grad()
-        return rendered
+        return rasterize_step(gaussians, camera, self.settings, watched=self.schedule.active(self.step))
 
     def compare(self, rendered: RasterResult, target: Target) -> Tensor:
         return photometric_loss(rendered.image, target, self.config.training.ssim_weight)
@@ -263,6 +260,7 @@ class Trainer:
         if rates is not None:
             references.copy_(before.lerp_(references, rates))
         self.optimizer.zero_grad(set_to_none=True)
+        self.views.learn(self.progress)
 
     def observe(self, rows: Tensor, prediction: Prediction, rendered: RasterResult, camera: Camera) -> None:
         """The statistics that growth and pruning go by."""
@@ -277,14 +275,11 @@ class Trainer:
         self.step += 1
         self.rate = self.target_size.follow(self.rate, self.step)
 
-    def skip(self, view: View) -> StepResult:
+    def skip(self, photograph: Target) -> StepResult:
         """A step on a view that no anchor is in: nothing can be learned from it."""
         self.finish_step()
         background = torch.tensor(self.scene.background, device=self.device)
-        return StepResult(torch.zeros(()), background.expand(*view.image.shape), view)
-
-    def target(self, view_index: int) -> Target:
-        return kept_target(self.targets, view_index, self.scene.train_views, self.device)
+        return StepResult(torch.zeros(()), background.expand(*photograph.image.shape), photograph)
 
     # events --------------------------------------------------------------------------------------------------------
 
@@ -334,10 +329,19 @@ class Trainer:
 
     # the run -------------------------------------------------------------------------------------------------------
 
-    def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
+    def run(
+        self,
+        path: Path | None,
+        on_progress: Callable[[TrainingStatus], None] | None,
+        watch: Watch | None = None,
+    ) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         check_points_seen(self.scene, self.settings.near_plane)
-        run_to_end(self, self.config.training, path, on_progress)
+        run_to_end(self, self.config.training, path, on_progress, watch)
+
+    def snapshot(self) -> HybridModel:
+        """What the file would hold of the scene now, but for primitives that the end of the run removes."""
+        return self.model.as_hybrid_model(stored_weights=self.stored)
 
     @property
     def primitives(self) -> int:
@@ -366,34 +370,35 @@ class Trainer:
     def save(self, path: Path) -> None:
         extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
         extra["chance"] = self.chance.get_state()
+        extra |= self.views.tensors()
         if self.reference_rates is not None:
             extra["reference_rates"] = self.reference_rates
         state = {
             "step": self.step,
-            "order": self.order,
-            "shuffle": self.shuffle.bit_generator.state,
-            "views": [view.name for view in self.scene.train_views],
+            **self.views.state(),
             "rate": asdict(self.rate),
         }
-        save_checkpoint(
-            path, Checkpoint(self.model, optimizer_tensors(self.model, self.optimizer), extra, state)
-        )
+        moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
+        save_checkpoint(path, Checkpoint(self.model, moments, extra, state))
 
     @classmethod
-    def resumed(cls, scene: Scene, checkpoint: Checkpoint, config: Config, device: torch.device) -> "Trainer":
-        """Raises CheckpointError if the run was another scene's or had other settings."""
-        check_same_run(checkpoint.model.config, config, checkpoint.state["views"], scene)
+    def resumed(cls, scene: Scene, path: Path, config: Config, device: torch.device) -> "Trainer":
+        """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
+        checkpoint = load_checkpoint(path)
+        with restoring(path):
+            check_same_run(checkpoint.model.config, config, checkpoint.state["views"], scene)
         trainer = cls(scene, config, device, checkpoint.model)
-        restore_optimizer(trainer.model, trainer.optimizer, checkpoint.optimizer)
-        for name in AdaptiveControl.STATISTICS:
-            setattr(trainer.control, name, checkpoint.extra[f"control/{name}"].to(device))
-        if "reference_rates" in checkpoint.extra:
-            trainer.reference_rates = checkpoint.extra["reference_rates"].to(device)
-        trainer.chance.set_state(checkpoint.extra["chance"])
-        trainer.shuffle.bit_generator.state = checkpoint.state["shuffle"]
-        trainer.order = checkpoint.state["order"]
-        trainer.step = checkpoint.state["step"]
-        trainer.rate = RateState(**checkpoint.state["rate"])
+        with restoring(path):
+            restore_optimizer(dict(trainer.model.named_parameters()), trainer.optimizer, checkpoint.optimizer)
+            restore_statistics(trainer.control, AdaptiveControl.STATISTICS, checkpoint.extra)
+            if any(at < checkpoint.state["step"] for at in trainer.decorrelated_at):
+                rates = checkpoint.extra["reference_rates"]
+                check_tensor(rates, (trainer.model.reference_dim,), torch.float32, "reference_rates")
+                trainer.reference_rates = rates.to(device)
+            restore_chance(trainer.chance, checkpoint.extra)
+            trainer.views.restore(checkpoint.state, checkpoint.extra)
+            trainer.step = checkpoint.state["step"]
+            trainer.rate = RateState.restored(checkpoint.state["rate"])
         return trainer
 
 

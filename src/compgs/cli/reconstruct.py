@@ -1,0 +1,144 @@
+"""`compgs reconstruct`: photographs or a video without poses -> a scene."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from compgs.cli.command import NO_DEFAULT, Command
+from compgs.cli.console import console, duration, say
+from compgs.cli.progress import LINE_SECONDS, counting_lines
+from compgs.cli.usage import check_range, settings_of_options
+
+if TYPE_CHECKING:
+    from compgs.reconstruct import Reconstruction
+    from compgs.reconstruct.mapping import Progress as StageProgress
+
+MOST_NAMES = 5  # of photographs without a pose, that are listed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct(Command):
+    """Find the poses of photographs, or of a video's frames, and write a scene that `compgs train` reads.
+
+    Photographs should overlap by two thirds, be sharp, and show something with texture that stands still; 30 to 300
+    of them, from all sides that are to be seen. COLMAP does the work (the extra `reconstruct`).
+
+    Examples
+
+    compgs reconstruct photos -o scenes/garden
+
+    compgs reconstruct walk.mp4 --frames 200 -o scenes/walk
+
+    compgs train scenes/garden -o runs/garden
+    """
+
+    photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")]
+    """Folder of photographs (folders inside it count, too), or a video."""
+
+    output: Annotated[Path, arg(aliases=["-o"], metavar="SCENE")]
+    """Folder for the scene: images/, sparse/0, reconstruction.json and reconstruction.png."""
+
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Which photographs are compared: each with each, or each with its neighbours by name, as in a video. By default
+    sequential for videos and for more than 300 photographs."""
+
+    overlap: Annotated[int, arg(metavar="N")] = 10
+    """Neighbours on each side in sequential matching."""
+
+    camera: Literal["auto", "one", "folder", "each"] = "auto"
+    """Which photographs share a lens: all, those of a folder, none; by default all if sizes and headers agree."""
+
+    lens: Annotated[str, arg(metavar="MODEL")] = "auto"
+    """COLMAP's model of the lens: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, PINHOLE, ..."""
+
+    frames: Annotated[int, arg(metavar="N")] = 120
+    """Frames to take from a video: the sharpest of each of N stretches."""
+
+    features: Annotated[int, arg(metavar="N")] = 4096
+    """Most features of a photograph; more help with fine texture, and take longer."""
+
+    feature_size: Annotated[int, arg(metavar="PIXELS")] = 1600
+    """Larger photographs are shrunk to this length of their longer side to find features."""
+
+    undistort: FlagCreatePairsOff[bool] = False
+    """Write images without lens distortion, for other programs; `compgs train` undistorts as it reads."""
+
+    threads: Annotated[int | None, arg(metavar="N", help_behavior_hint=NO_DEFAULT)] = None
+    """Threads to use; all cores by default."""
+
+    seed: Annotated[int, arg(metavar="N")] = 0
+    """Of everything random."""
+
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace a scene that is in SCENE already."""
+
+    def run(self) -> None:
+        from compgs.reconstruct import ReconstructOptions, reconstruct
+
+        check_range("--seed", self.seed, 0, 2**31 - 1)
+        if self.threads is not None:
+            check_range("--threads", self.threads, 1, 1024)
+        options = ReconstructOptions(
+            matching=self.matching,
+            overlap=self.overlap,
+            shared=self.camera,
+            lens=self.lens,
+            frames=self.frames,
+            features=self.features,
+            feature_size=self.feature_size,
+            undistort=self.undistort,
+            threads=self.threads,
+            seed=self.seed,
+        )
+        with settings_of_options(), _stages() as progress:
+            result = reconstruct(
+                self.photographs, self.output, options, overwrite=self.overwrite, progress=progress
+            )
+        show(result)
+
+
+def show(result: "Reconstruction") -> None:
+    """A few lines for people."""
+    times = ", ".join(f"{stage} {duration(seconds)}" for stage, seconds in result.seconds.items())
+    say(
+        f"{result.scene}: {result.registered} of {result.photographs} photographs have a pose, "
+        f"{result.points:,} points, reprojection error {result.reprojection_error:.2f} pixels"
+    )
+    say(f"{result.lens}, {result.matching} matching; {times}")
+    if result.missing:
+        names = ", ".join(result.missing[:MOST_NAMES]) + (", ..." if len(result.missing) > MOST_NAMES else "")
+        say(f"note: without a pose: {names}")
+    if result.missing and result.models > 1:
+        say(f"note: {result.models} parts could not be joined; the largest is the scene")
+    say(f"{result.scene / 'reconstruction.png'} shows cameras and points; next: compgs train {result.scene}")
+
+
+@contextmanager
+def _stages() -> "Iterator[StageProgress]":
+    """A bar, or lines, for each stage in turn."""
+    if not console.is_terminal:
+        lines: dict[str, Callable[[int, int], None]] = {}
+
+        def write(stage: str, done: int, total: int) -> None:
+            if stage not in lines:
+                say(f"{stage}: {total} to do; a line every {LINE_SECONDS:.0f} seconds")
+                lines[stage] = counting_lines(stage)
+            lines[stage](done, total)
+
+        yield write
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield show

@@ -1,0 +1,21 @@
+"""Photographs or a video without poses -> a scene that `load_scene` reads: poses and points by COLMAP (pycolmap).
+
+```text
+photographs.py   finds photographs, stores them upright            video.py    the sharpest frames of a video
+cameras.py       which photographs share a camera                   mapping.py  the three stages of COLMAP, run aside
+worker.py        the process that runs them                         report.py   what came out: numbers and a picture
+```
+"""
+
+from compgs.reconstruct.mapping import Stage
+from compgs.reconstruct.photographs import find_photographs, holds_photographs
+from compgs.reconstruct.reconstruct import Reconstruction, ReconstructOptions, reconstruct
+
+__all__ = [
+    "ReconstructOptions",
+    "Reconstruction",
+    "Stage",
+    "find_photographs",
+    "holds_photographs",
+    "reconstruct",
+]

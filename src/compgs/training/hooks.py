@@ -1,0 +1,103 @@
+"""What a method adds to plain 3DGS: the moments of a run at which it may act (`training/splat_trainer.py`).
+
+    parameters ──transform──► splats ──rasterize──► image ──compare, + loss──► gradients ──► step ──► after_step
+                               at the steps of density control: ──► densified
+
+A hook's own parameters (codebooks, masks, decoders) are those of a `torch.nn.Module`: the run trains them at the
+`rates` they name, and checkpoints keep them with its buffers.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from torch import Tensor, nn
+
+from compgs.cameras import Camera
+from compgs.gaussians import Gaussians
+from compgs.losses import Target
+from compgs.render import RasterResult
+from compgs.tensors.splats import Splats
+
+if TYPE_CHECKING:
+    from compgs.training.splat_trainer import SplatTrainer
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A training view as it was drawn, in the autograd graph."""
+
+    camera: Camera
+    photograph: Target
+    splats: Splats  # as they were drawn: after the hooks' `transform`
+    gaussians: Gaussians
+    rendered: RasterResult
+
+
+class Hooks(nn.Module):
+    """Plain 3DGS: nothing is added. A method overrides what it needs.
+
+    All methods but `transform` and `loss` are called without an autograd graph of the step being kept.
+    """
+
+    # First and last learning rate (exponential between them) of parameters, or of modules of them, by name.
+    rates: Mapping[str, tuple[float, float]] = {}
+    # Names of parameters and buffers [M, ...] with a row for each splat: the rows follow when splats are cloned, split
+    # or removed. A new splat has the row of the one it came from.
+    per_splat: tuple[str, ...] = ()
+
+    def begin(self, trainer: "SplatTrainer") -> None:
+        """Before the first step, not when a run is resumed: make what depends on the splats there are."""
+
+    def view(self, camera: Camera, photograph: Target, trainer: "SplatTrainer") -> tuple[Camera, Target]:
+        """What this step looks at: the view as it is, a smaller one, another picture of it."""
+        return camera, photograph
+
+    def transform(self, splats: Splats, trainer: "SplatTrainer") -> Splats:
+        """The splats as they are drawn, differentiable: quantized, masked, decoded. Density control judges these."""
+        return splats
+
+    def loss(self, drawn: Drawn, trainer: "SplatTrainer") -> Tensor | None:
+        """[] to add to the loss of a view: a penalty, a rate, a distillation."""
+        return None
+
+    def densified(self, trainer: "SplatTrainer") -> None:
+        """Right after splats were cloned, split and removed."""
+
+    def after_step(self, trainer: "SplatTrainer") -> None:
+        """After each step; `trainer.step` is the number of steps done."""
+
+    def finish(self, trainer: "SplatTrainer") -> None:
+        """After the last step. Called again if the finished run is resumed: the second time must change nothing."""
+
+    def estimated_bytes(self, trainer: "SplatTrainer") -> int | None:
+        """Of the file, if it were written now; None: those of a .ply file."""
+        return None
+
+
+def hook_state(hooks: Hooks) -> dict[str, Tensor]:
+    """Parameters and buffers by name."""
+    return dict(hooks.state_dict())
+
+
+def restore_hooks(hooks: Hooks, tensors: Mapping[str, Tensor]) -> None:
+    """Inverse of `hook_state`, also for what `begin` or later steps would have made, of whatever shape."""
+    trained = {
+        name for rate in hooks.rates for name in tensors if name == rate or name.startswith(f"{rate}.")
+    }
+    for name, value in tensors.items():
+        path, _, attribute = name.rpartition(".")
+        module = hooks.get_submodule(path)
+        if name in trained:
+            setattr(module, attribute, nn.Parameter(value))
+        else:
+            module.register_buffer(attribute, value)
+
+
+def parameter_groups(hooks: Hooks) -> dict[str, list[nn.Parameter]]:
+    """The parameters that there are now, by the name of their learning rate in `rates`."""
+    named = list(hooks.named_parameters())
+    groups = {
+        rate: [p for name, p in named if name == rate or name.startswith(f"{rate}.")] for rate in hooks.rates
+    }
+    return {rate: parameters for rate, parameters in groups.items() if parameters}
