@@ -59,7 +59,7 @@ def test_there_are_never_more_points_than_a_page_can_show() -> None:
 
 def test_points_are_the_anchors_of_a_file(tiny_cgs: Path) -> None:
     model = compgs.decode(tiny_cgs)
-    np.testing.assert_array_equal(anchor_points(model), model.primitives.positions.numpy())
+    np.testing.assert_array_equal(anchor_points(model), model.primitives.positions)
 
 
 def test_no_more_frustums_than_can_be_told_apart() -> None:
