@@ -2,6 +2,7 @@
 # make test   the test suite
 # make lint   style and types
 # make bounds the installation without extras, at the lowest versions that pyproject.toml allows, in a folder of its own
+# make docs   the documentation as a site, in build/site
 # make web    the page that shows scenes in a browser, from web/; needs node 20 or later, and npm
 # Needs python3 (3.11 or later) and make; everything else is installed into .venv in this folder.
 
@@ -15,7 +16,7 @@ export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 # Idle OpenMP threads sleep instead of taking the cores from numba's.
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: help demo test lint bounds web venv
+.PHONY: help demo test lint bounds docs web venv
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -49,6 +50,9 @@ lint: venv
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@$(BIN)/mypy
+
+docs: venv
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build && echo "the site is build/site/index.html"
 
 bounds:
 	@$(PYTHON) tools/check_bounds.py

@@ -63,9 +63,10 @@ ALLOWED = {
     "evaluation": BASE | {"scene", "render", "model", "devices", "metrics", "codec", "formats"},
     "viewer": BASE | {"render", "model", "devices", "metrics", "codec", "formats", "evaluation"},
     "exporting": BASE | {"render", "model", "devices", "metrics", "formats", "evaluation", "viewer"},
+    "suites": BASE | {"evaluation", "methods", "metrics"},
     "cli": BASE
     | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "viewer", "methods", "reconstruct"},
+    | {"trained_model", "exporting", "viewer", "methods", "reconstruct", "suites"},
     "__main__": BASE | {"cli"},
 }
 

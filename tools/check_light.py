@@ -2,8 +2,8 @@
 
     python tools/check_light.py FILE FOLDER
 
-FILE is a .cgs with viewpoints; what is written goes to FOLDER, which must be new. Prints how long it took. `make bounds`
-runs it at the lowest versions; the tests run it where torch, scipy and safetensors are hidden.
+FILE is a .cgs with viewpoints; what is written goes to FOLDER, which must be new. Prints how long it took. `make
+bounds` runs it at the lowest versions; the tests run it where torch, scipy and safetensors are hidden.
 """
 
 import shutil

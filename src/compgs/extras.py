@@ -8,6 +8,8 @@ from compgs.errors import MissingDependency, install_line
 PACKAGES: dict[str, tuple[str, ...]] = {
     "train": ("torch", "scipy", "safetensors"),
     "cuda": ("torch", "gsplat"),
+    "reconstruct": ("pycolmap",),
+    "cluster": ("ray",),
 }
 
 

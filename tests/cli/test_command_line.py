@@ -25,8 +25,8 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
 
 def test_the_commands_are_there() -> None:
     assert NAMES == [
-        "reconstruct", "train", "encode", "decode", "render", "evaluate", "view", "compare", "report", "export",
-        "serve", "info", "demo-scene",
+        "reconstruct", "train", "encode", "decode", "render", "evaluate", "view", "compare", "report", "benchmark",
+        "export", "serve", "info", "demo-scene",
     ]  # fmt: skip
 
 
@@ -118,6 +118,7 @@ def test_rubbish_in_place_of_a_number_is_named_with_its_option_and_what_was_expe
         "export": ["out.ply"],
         "compare": ["other"],
         "report": ["-o", "out.html"],
+        "benchmark": ["-o", "out"],
     }
     output = needed.get(command, [])
     code, _, err = outcome(capsys, command, "something", *output, option, *["rubbish"] * count)

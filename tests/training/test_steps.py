@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from compgs.config import Config
-from compgs.numerics.ssim import ssim
 from compgs.render import render
 from compgs.scene.views import Scene, View
+from compgs.tensors.ssim import ssim
 from compgs.training.rate_control import RateState
 from compgs.training.trainer import Trainer
 

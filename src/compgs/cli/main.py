@@ -12,6 +12,7 @@ from rich.table import Table
 
 from compgs import __version__
 from compgs.cli.arguments import command_name, parse_command
+from compgs.cli.benchmark import Benchmark
 from compgs.cli.command import Command
 from compgs.cli.compare import Compare
 from compgs.cli.compiling import say_when_compiling
@@ -42,6 +43,7 @@ COMMANDS: tuple[type[Command], ...] = (
     View,
     Compare,
     Report,
+    Benchmark,
     Export,
     Serve,
     Info,

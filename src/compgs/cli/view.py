@@ -57,13 +57,11 @@ class View(ComputingCommand, SceneFileOrRunArgument):
         file, _ = file_and_run(self.file)
         check_scene(file)
         self.prepare("decode", "render")
-        import torch
-
+        from compgs.devices import chosen_device
         from compgs.viewer.shown import FileShown
         from compgs.viewer.stage import OwnThread
 
-        device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
-        shown = FileShown(file, device, self.background)
+        shown = FileShown(file, chosen_device(self.device), self.background)
         with listening(shown, OwnThread(self.prepare), self.host, self.port) as viewer:
             say(f"{file}: {viewer.address}")
             if self.open:

@@ -31,7 +31,7 @@ class Ellipsoids:
 
 def anchor_points(model: Renderable) -> np.ndarray:
     """[N, 3] float32: anchors, or splats where there are none; evenly chosen if there are too many."""
-    positions = model.bounds[0].detach().cpu().numpy()
+    positions = model.bounds[0]
     return positions[:: -(-len(positions) // MOST_POINTS)]
 
 
@@ -41,10 +41,10 @@ def ellipsoids(model: Renderable, camera: Camera, most: int) -> Ellipsoids:
     width, height = max(1, round(share * camera.width)), max(1, round(share * camera.height))
     local = local_camera(model, camera.resized(width, height))
     g = model.gaussians(local, visible_mask(*model.bounds, local, RasterSettings()))
-    weights = contributions(g, local).cpu().numpy()
+    weights = contributions(g, local)
     largest = np.argsort(-weights, kind="stable")[: min(most, int((weights > 0).sum()))]
     means, quaternions, scales, colors = (
-        t.detach().cpu().numpy()[np.sort(largest)] for t in (g.means, g.quaternions, g.scales, g.colors)
+        t[np.sort(largest)] for t in (g.means, g.quaternions, g.scales, g.colors)
     )
     return Ellipsoids(
         means,

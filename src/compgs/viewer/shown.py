@@ -13,7 +13,7 @@ from compgs.formats import format_of, open_scene
 from compgs.render import Renderable
 
 if TYPE_CHECKING:
-    import torch
+    pass
 
 Vector = tuple[float, float, float]
 KEPT_LEVELS = 3  # decoded beginnings of a file that are kept beside the whole
@@ -62,7 +62,7 @@ class Shown(Protocol):
 class FileShown:
     """A file, or a beginning of it. Raises BitstreamError, SplatFileError."""
 
-    def __init__(self, path: Path, device: "torch.device | str", background: Vector | None = None) -> None:
+    def __init__(self, path: Path, device: str, background: Vector | None = None) -> None:
         self.path = path
         self.device = device
         self.whole = open_scene(path, device, background or (0.0, 0.0, 0.0))
@@ -77,7 +77,7 @@ class FileShown:
         self.cameras = tuple((f"camera {i}", camera) for i, camera in enumerate(cameras)) or (
             ("circle", _beside(self.whole)),
         )
-        self.positions = self.whole.bounds[0].detach().cpu().numpy()
+        self.positions = self.whole.bounds[0]
 
     def model(self, level: int, *, fresh: bool = True) -> Renderable:
         """Raises BitstreamError for a part that is damaged."""
@@ -144,7 +144,7 @@ def _in_words(count: int) -> str:
 
 def _beside(model: Renderable) -> Camera:
     """Of the world, where a file keeps no camera."""
-    ((_, camera),) = orbit(model.bounds[0].cpu().numpy(), frames=1, width=640, height=480)
+    ((_, camera),) = orbit(model.bounds[0], frames=1, width=640, height=480)
     return camera.moved(-np.array(model.world_offset))
 
 
