@@ -138,6 +138,23 @@ def test_views_that_all_look_elsewhere_are_an_error_before_any_step(blob_scene, 
         train(scene, tiny_config)
 
 
+def test_progress_tells_the_quality_of_the_view_that_was_trained_on(blob_scene, tiny_config, monkeypatch):
+    trainer = Trainer(blob_scene, tiny_config, CPU)
+    results, step, told = [], trainer.train_step, []
+    monkeypatch.setattr(trainer, "train_step", lambda: results.append(step()) or results[-1])
+
+    def tell(status):
+        result = results[-1]
+        error = result.image.clamp(0, 1).double() - result.photograph.image.double() / 255
+        told.append((status.psnr, -10 * float(error.square().mean().log10())))
+        assert status.loss == pytest.approx(float(result.loss))
+
+    trainer.run(None, tell)
+    assert len(told) == 4
+    for found, expected in told:
+        assert found == pytest.approx(expected, abs=1e-3)
+
+
 def test_no_training_views_is_a_settings_error(blob_scene, tiny_config):
     with pytest.raises(ConfigError, match="no training views"):
         train(replace(blob_scene, train_views=()), tiny_config)
@@ -198,9 +215,9 @@ def test_unquantized_latents_are_rendered_as_they_are(blob_scene, tiny_config):
     shown = model.as_hybrid_model(stored_weights=False).primitives
     kept = model.mask.view(-1)
     step = config.entropy.reference_step
-    assert torch.equal(shown.references, model.references.detach() * step)
+    assert torch.equal(torch.as_tensor(shown.references), model.references.detach() * step)
     flat = model.residuals.detach().view(len(kept), -1)
-    assert torch.equal(shown.residuals, flat[kept] * config.entropy.residual_step)
+    assert torch.equal(torch.as_tensor(shown.residuals), flat[kept] * config.entropy.residual_step)
 
 
 def test_primitives_that_add_least_are_left_out_up_to_their_share():
