@@ -30,9 +30,9 @@ def main() -> None:
         environment = Path(folder, "environment")
         venv.create(environment, with_pip=True)
         python = next(environment.glob("[bS]*/python*"))
-        pip = [str(python), "-m", "pip", "--quiet", "--disable-pip-version-check"]
+        pip = [str(python), "-m", "pip", "--disable-pip-version-check"]
         before = size_of(environment)
-        subprocess.run([*pip, "install", str(ROOT), *wanted], check=True)
+        subprocess.run([*pip, "install", "--quiet", str(ROOT), *wanted], check=True)
         print(f"{(size_of(environment) - before) / 1e6:.0f} MB were installed:")
         subprocess.run([*pip, "list"], check=True)
         subprocess.run(
