@@ -9,12 +9,12 @@ from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.model.constants import CUTOFF_SIGMAS
 from compgs.model.heads import PredictionHeads
 from compgs.model.inference import DrawnArrays, SceneArrays
 from compgs.model.prediction import (
     camera_center,
     choosing_pays,
+    drawn_reach,
     predict_appearance,
     predict_geometry,
     runs_in_kernels,
@@ -110,8 +110,7 @@ class HybridModel:
         for _, coupled in self._blocks():
             index = p.anchor_index[coupled]
             offset = means[coupled] - p.positions.index_select(0, index)
-            reach = offset.norm(dim=1) + CUTOFF_SIGMAS * scales[coupled].amax(1)
-            radii.scatter_reduce_(0, index, reach, "amax")
+            radii.scatter_reduce_(0, index, drawn_reach(offset, scales[coupled]), "amax")
         return p.positions, radii
 
     def gaussians(self, camera: Camera, visible: Tensor | None = None) -> Gaussians:
