@@ -7,6 +7,7 @@ import torch
 
 from compgs.config import Config
 from compgs.losses import photometric_loss
+from compgs.render import rasterize
 from compgs.scene.views import Scene
 from compgs.training.trainer import Trainer
 
@@ -48,8 +49,6 @@ def test_an_anchor_that_no_view_misses_can_go_without_a_change(
     def distortion() -> float:
         rows = trainer.visible_anchors(view.camera)
         gaussians = trainer.predict(trainer.model.quantized(rows), rows, view.camera, True).gaussians
-        from compgs.render import rasterize
-
         with torch.no_grad():
             return float(
                 photometric_loss(

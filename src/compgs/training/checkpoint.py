@@ -21,7 +21,6 @@ from compgs.errors import CheckpointError, OutputError
 from compgs.outputs import replacing
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
-from compgs.training.decorrelation import keep_channels
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 CHECKPOINT_VERSION = "2"
@@ -89,11 +88,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
         scene["distance_unit"],
         tuple(scene["background"]),
         tuple(scene["world_offset"]),
+        reference_dim=parts["model"]["references"].shape[1],
     )
     model.viewpoints = tuple(_camera(entry) for entry in scene["viewpoints"])
     model.up = tuple(scene["up"])
-    channels = parts["model"]["references"].shape[1]
-    keep_channels(model, torch.arange(model.reference_dim) < channels)
     model.load_state_dict(parts["model"])
     return Checkpoint(model, parts["optimizer"], parts["extra"], json.loads(metadata["state"]))
 

@@ -44,7 +44,7 @@ class AnchorBounds:
     @torch.no_grad()
     def radii(self) -> Tensor:
         """[N] world units."""
-        if self.measured is None:
+        if self.measured is None or len(self.measured) != self.model.anchors:
             self.measured = self._measure() / self._sizes()
         return MARGIN * self.measured * self._sizes()
 

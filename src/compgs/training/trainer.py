@@ -217,25 +217,11 @@ class Trainer:
         """D + lambda R (Eq. 1), once the rate has joined the loss; with lambda 0 only the entropy model learns R."""
         if not latents.bits:
             return distortion
-        r = rate(latents.bits, self.channels(), self.config.training.rate)
+        r = rate(latents.bits, self.model.entropy.channels, self.config.training.rate)
         if self.rate.lmbda > 0:
             return rate_distortion_loss(distortion, r, self.rate.lmbda)
         r.backward(inputs=self.model.entropy.statistics(), retain_graph=True)
         return distortion
-
-    def channels(self) -> dict[str, int]:
-        """Symbols that each stream codes for an anchor, by the stream's name."""
-        m, e = self.config.model, self.config.entropy
-        own = {
-            "residual_hyper": m.coupled_primitives,
-            "residual": m.coupled_primitives * m.residual_dim,
-        }
-        return {
-            "reference_hyper": e.reference_hyper_dim,
-            "reference": self.model.reference_dim,
-            "covariance": 6,
-            **(own if m.residuals else {}),
-        }
 
     def backward(
         self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians, latents: Quantized
@@ -286,7 +272,7 @@ class Trainer:
     @torch.no_grad()
     def coupled_means(self) -> Tensor:
         """[N, K, 3] world units: where the coupled primitives are now."""
-        k = self.config.model.coupled_primitives
+        k = self.model.dimensions.coupled_primitives
         every = torch.arange(self.model.anchors, device=self.device).split(MEASURED_AT_ONCE)
         return torch.cat([self.geometry(rows)[0].view(-1, k, 3) for rows in every])
 
@@ -321,7 +307,7 @@ class Trainer:
                 return None
             return rows, self.predict(self.model.quantized(rows), rows, camera, stored=True)
 
-        shape = self.model.anchors, self.config.model.coupled_primitives
+        shape = self.model.anchors, self.model.dimensions.coupled_primitives
         views = spread(self.scene.train_views, most)
         return view_contributions(views, predicted, shape, self.settings, self.device)
 
