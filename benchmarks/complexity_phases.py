@@ -123,12 +123,13 @@ def trained(run: Run) -> Any:
         from compgs.training import load_run
 
         return load_run(run.folder)
-    from compgs.model.splats import SplatModel, Splats
+    from compgs.model.splats import SplatModel
+    from compgs.tensors.splats import Splats
     from compgs.training.checkpoint import read_checkpoint_file, tensors_by_kind
     from compgs.training.splat_trainer import METHOD
 
     tensors, _ = read_checkpoint_file(run.folder / CHECKPOINT_NAME, METHOD)
-    return SplatModel(Splats(**tensors_by_kind(tensors)["model"]), BLACK)
+    return SplatModel(Splats(**tensors_by_kind(tensors)["model"]).arrays(), BLACK)
 
 
 def decode(run: Run) -> dict[str, Any]:

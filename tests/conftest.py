@@ -1,5 +1,6 @@
-"""What tests of several rooms need: Ctrl-C that is heard, a scene small enough to train, and a small .cgs file."""
+"""What tests of several rooms need: Ctrl-C that is heard, a scene to train, a small .cgs file, and a browser."""
 
+import shutil
 import signal
 from pathlib import Path
 
@@ -13,8 +14,8 @@ from compgs.codec.writer import write_content
 from compgs.config import Config, ModelConfig
 from compgs.evaluation.camera_path import orbit
 from compgs.gaussians import Gaussians
-from compgs.render import rasterize
 from compgs.scene.views import Points, Scene, View
+from compgs.tensors.rasterize import rasterize
 from compgs.trained_model import TrainedModel
 
 
@@ -96,3 +97,12 @@ def tiny_cgs(tmp_path: Path, cgs_bytes: bytes) -> Path:
     path = tmp_path / "tiny.cgs"
     path.write_bytes(cgs_bytes)
     return path
+
+
+@pytest.fixture(scope="session")
+def browser() -> str:
+    """Path of a Chromium; tests that need one are skipped where there is none."""
+    for name in ("chromium", "chromium-browser", "google-chrome"):
+        if path := shutil.which(name):
+            return path
+    pytest.skip("no Chromium is on PATH")

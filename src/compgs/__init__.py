@@ -34,6 +34,7 @@ _HOME = {
     "render": "compgs.render",
     "evaluate": "compgs.evaluation",
     "compare": "compgs.evaluation",
+    "report": "compgs.evaluation.reports",
     "export": "compgs.exporting",
     "open_scene": "compgs.formats",
     "load_config": "compgs.config",
@@ -56,6 +57,7 @@ __all__ = [
     "load_scene",
     "open_scene",
     "render",
+    "report",
     "train",
 ]
 
@@ -66,6 +68,7 @@ if TYPE_CHECKING:
     from compgs.errors import CompGSError
     from compgs.evaluation import compare as compare
     from compgs.evaluation import evaluate as evaluate
+    from compgs.evaluation.reports import report as report
     from compgs.exporting import export
     from compgs.formats import open_scene
     from compgs.gaussians import Gaussians

@@ -57,11 +57,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file whole or not at all; folders on the way are made. Raises OutputError."""
-    try:
-        with replacing(path) as temporary:
-            temporary.write_bytes(data)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    with _written(path), replacing(path) as temporary:
+        temporary.write_bytes(data)
 
 
 @contextlib.contextmanager
@@ -72,13 +69,23 @@ def filling(folder: Path) -> Iterator[Path]:
     Numbered pictures (`00007.png`) that are beside new ones and not among them are of something earlier: they go.
     Raises OutputError.
     """
+    with contextlib.ExitStack() as stack:
+        with _written(folder):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            place = tempfile.TemporaryDirectory(prefix=f".{folder.name[:40]}.", dir=folder.parent)
+        temporary = Path(stack.enter_context(place))
+        yield temporary
+        with _written(folder):
+            _move_files(temporary, folder)
+
+
+@contextlib.contextmanager
+def _written(path: Path) -> Iterator[None]:
+    """Raises OutputError for what the system refuses inside."""
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:40]}.", dir=folder.parent) as temporary:
-            yield Path(temporary)
-            _move_files(Path(temporary), folder)
+        yield
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be written ({error.strerror or error})") from error
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def _move_files(source: Path, target: Path) -> None:

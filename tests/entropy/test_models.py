@@ -6,6 +6,7 @@ import torch
 
 from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy import STREAMS, EntropyModel
+from compgs.entropy.gaussian import gaussian_bits
 from compgs.entropy.models import make_entropy_model
 from compgs.entropy.network import EntropyNetwork
 
@@ -99,6 +100,31 @@ def test_without_noise_training_sees_the_density_at_the_symbols_and_has_gradient
     torch.stack([b.sum() for b in bits.values()]).sum().backward()
     assert all(float(y.grad.abs().sum()) > 0 for y in latents)
     assert float(entropy.residual_density.logits.grad.abs().sum()) > 0
+
+
+def test_in_training_the_likelihood_sees_latents_and_hyperpriors_with_noise_in_place_of_rounding(entropy):
+    f, c, g = latents()
+    bits = entropy(f, c, g, rate=True, noise=lambda like: torch.full_like(like, 0.3)).bits
+    z = entropy.reference_analysis(f), entropy.residual_analysis(g)
+    for name, y, density in zip(
+        ("reference_hyper", "residual_hyper"),
+        z,
+        (entropy.reference_density, entropy.residual_density),
+        strict=True,
+    ):
+        # The mass of a unit interval lies in two bins, in proportion.
+        p = density.probabilities().double()
+        left = (y.double() + 0.3).floor()
+        part = y.double() + 0.3 - left
+        column = (left.long() + p.shape[1] // 2).t()
+        mass = p.gather(1, column).t() * (1 - part) + p.gather(1, column + 1).t() * part
+        torch.testing.assert_close(bits[name].double(), -mass.log2().sum(1), rtol=1e-4, atol=1e-4)
+    for name, y, network, context in (
+        ("reference", f, entropy.reference_network, z[0].round()),
+        ("covariance", c, entropy.covariance_network, entropy(f, c, g, rate=False).references),
+    ):
+        mean, scale = network(context)
+        torch.testing.assert_close(bits[name], gaussian_bits(y - mean + 0.3, scale), rtol=1e-3, atol=1e-2)
 
 
 def test_residuals_are_predicted_from_references_and_then_their_hyperprior(entropy):

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 import compgs
@@ -16,10 +15,10 @@ from compgs.errors import NotACompGSFile, OutputError, SceneError, UnsupportedCa
 from compgs.evaluation import compare, comparison
 from compgs.evaluation.camera_path import camera_entry, read_cameras
 from compgs.evaluation.comparison import PAGE_NAME
-from compgs.formats import arrays_of, encoded, write_ply
+from compgs.formats import encoded, write_ply
 from compgs.formats.splat import ROW
 from compgs.model.spherical_harmonics import Y0
-from compgs.model.splats import Splats
+from compgs.model.splats import SplatArrays
 from compgs.scene.views import Points, Scene, View
 
 from .reports.parsed_page import ParsedPage
@@ -34,28 +33,28 @@ def camera(shift: float = 0.0) -> Camera:
     return Camera(pose, 40.0, 40.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
 
 
-def wall(level: int) -> Splats:
+def wall(level: int) -> SplatArrays:
     """One splat that covers every picture of `camera` with a level of gray, whatever is behind."""
-    return Splats(
-        means=torch.tensor([[0.0, 0.0, WALL]]),
-        log_scales=torch.full((1, 3), math.log(100.0)) + torch.tensor([[0.0, 0.0, -9.0]]),
-        quaternions=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        opacity_logits=torch.tensor([20.0]),
-        dc=torch.full((1, 3), (level / 255 - 0.5) / Y0),
-        rest=torch.zeros(1, 0, 3),
-    )
+    return SplatArrays(
+        means=np.array([[0.0, 0.0, WALL]]),
+        log_scales=np.full((1, 3), math.log(100.0)) + np.array([[0.0, 0.0, -9.0]]),
+        quaternions=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        opacity_logits=np.array([20.0]),
+        dc=np.full((1, 3), (level / 255 - 0.5) / Y0),
+        rest=np.zeros((1, 0, 3)),
+    ).each(np.float32)
 
 
-def cloud(count: int = 60) -> Splats:
-    chance = torch.Generator().manual_seed(0)
-    return Splats(
-        means=torch.rand(count, 3, generator=chance),
-        log_scales=torch.full((count, 3), -2.5),
-        quaternions=torch.randn(count, 4, generator=chance),
-        opacity_logits=torch.linspace(-3, 3, count),
-        dc=torch.randn(count, 3, generator=chance),
-        rest=0.2 * torch.randn(count, 3, 3, generator=chance),
-    )
+def cloud(count: int = 60) -> SplatArrays:
+    chance = np.random.default_rng(0)
+    return SplatArrays(
+        means=chance.random((count, 3)),
+        log_scales=np.full((count, 3), -2.5),
+        quaternions=chance.normal(size=(count, 4)),
+        opacity_logits=np.linspace(-3, 3, count),
+        dc=chance.normal(size=(count, 3)),
+        rest=0.2 * chance.normal(size=(count, 3, 3)),
+    ).each(np.float32)
 
 
 def photographs(levels: list[int]) -> Scene:
@@ -149,7 +148,7 @@ def test_every_format_is_compared_with_every_other(kind: str, tmp_path: Path, ti
         record["scale"], record["color"], record["rotation"] = 0.05, 200, (255, 128, 128, 128)
         other.write_bytes(record.tobytes())
     else:
-        other.write_bytes(encoded(arrays_of(cloud()), kind))
+        other.write_bytes(encoded(cloud(), kind))
     found = compare(tiny_cgs, other, device="cpu")
     assert (found.a.format, found.b.format) == ("cgs", kind)
     assert found.b.primitives == found.b.splats == (50 if kind == "splat" else 60)
@@ -192,8 +191,8 @@ def test_both_are_seen_over_one_background(tmp_path: Path, tiny_cgs: Path) -> No
 
 def test_positions_that_have_lost_their_origin_are_put_back(tmp_path: Path) -> None:
     origin = (4.0e6, -2.0e5, 17.0)
-    (tmp_path / "far.glb").write_bytes(encoded(arrays_of(cloud(), origin), "glb"))
-    (tmp_path / "local.spz").write_bytes(encoded(arrays_of(cloud()), "spz"))
+    (tmp_path / "far.glb").write_bytes(encoded(replace(cloud(), world_offset=origin), "glb"))
+    (tmp_path / "local.spz").write_bytes(encoded(cloud(), "spz"))
     for files in (("far.glb", "local.spz"), ("local.spz", "far.glb")):
         found = compare(*(tmp_path / name for name in files), device="cpu")
         assert found.psnr > 25 and found.a.psnr is None
@@ -204,8 +203,8 @@ def test_positions_that_have_lost_their_origin_are_put_back(tmp_path: Path) -> N
 
 def test_positions_near_the_origin_stay_where_they_are(tmp_path: Path) -> None:
     origin = (3.0, 0.0, 0.0)
-    (tmp_path / "a.glb").write_bytes(encoded(arrays_of(cloud(), origin), "glb"))
-    write_ply(cloud(), tmp_path / "b.ply", world_offset=origin)
+    (tmp_path / "a.glb").write_bytes(encoded(replace(cloud(), world_offset=origin), "glb"))
+    write_ply(replace(cloud(), world_offset=origin), tmp_path / "b.ply")
     found = compare(tmp_path / "a.glb", tmp_path / "b.ply", device="cpu")
     assert found.notes == () and found.psnr > 60
 
@@ -221,7 +220,7 @@ def test_what_is_written_says_what_was_found(walls: tuple[Path, Path], tmp_path:
     assert [name for name, _ in read_cameras(out / "cameras.json")] == ["0.jpg", "1.jpg", "2.jpg"]
     for folder, level in (("a", 100), ("b", 110), ("gt", 95)):
         assert (np.asarray(Image.open(out / folder / "00002.png")) == level).all()
-    assert rows[0]["difference_scale"] == 16
+    assert [row["difference_scale"] for row in rows] == [16] * 3
     difference = np.asarray(Image.open(out / "difference" / "00002.png"))
     assert difference.shape == (HEIGHT, WIDTH, 3) and np.ptp(difference.reshape(-1, 3), axis=0).max() == 0
     assert [path.name for path in out.parent.iterdir()] == ["out"]

@@ -101,3 +101,13 @@ def test_the_field_of_view_goes_from_one_camera_s_to_the_next_at_any_size() -> N
     assert {(c.cx, c.cy, c.width, c.height) for c in way} == {(100.0, 50.0, 200, 100)}
     with pytest.raises(UnsupportedCamera, match="found 1"):
         way_through([turned(0.0)], frames=3, width=64, height=48)
+
+
+def test_a_way_is_smooth_far_from_the_origin_and_where_cameras_stand_in_one_place() -> None:
+    far = 4.5e6
+    stops = [(far, 0, 0), (far + 1, 0, 0), (far + 1, 0, 0), (far + 2, 0, 0)]
+    way = way_through([turned(0.3 * i, stop) for i, stop in enumerate(stops)], frames=91, width=64, height=48)
+    centers = np.stack([camera.center for camera in way]) - (far, 0, 0)
+    assert (np.diff(centers[:, 0]) > -1e-4).all()
+    np.testing.assert_allclose(centers[[0, -1], 0], (0, 2), atol=1e-6)
+    np.testing.assert_allclose(centers[:, 1:], 0, atol=1e-4)

@@ -10,10 +10,11 @@ import torch
 from torch import nn
 
 from compgs.config import Config, Range
-from compgs.formats import SplatArrays, arrays_of
+from compgs.formats import SplatArrays
 from compgs.formats.packed import SUFFIX, Packed, packed_bits, splat_model, unpacked_bits, write_packed
 from compgs.methods import METHODS, SPLAT_SETTINGS, Method
-from compgs.model.splats import SplatModel, Splats
+from compgs.model.splats import SplatModel
+from compgs.tensors.splats import Splats
 from compgs.training import Hooks, Phase, fine_tuning, train_phases
 
 BITS = 3
@@ -85,7 +86,7 @@ def train(scene: Any, config: ToyConfig, run: Any, start: SplatModel | None = No
 
 def write(trained: tuple[Any, Any], path: Path, config: ToyConfig) -> int:
     model, colors = trained
-    arrays = arrays_of(model.splats)
+    arrays = model.splats
     stored = {
         name: getattr(arrays, name) for name in ("means", "log_scales", "quaternions", "opacity_logits")
     }

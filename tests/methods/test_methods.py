@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import compgs
 from compgs.cli import train as train_command
@@ -53,7 +52,7 @@ def test_the_registry_says_what_a_reader_needs_to_know() -> None:
 
 def test_training_by_name_is_training_by_the_function(blob_scene: Scene, trained: SplatModel) -> None:
     again = compgs.training.train_splats(blob_scene, quick("3dgs"), device="cpu")  # type: ignore[attr-defined]
-    assert torch.equal(trained.splats.means, again.splats.means)
+    assert np.array_equal(trained.splats.means, again.splats.means)
     assert len(trained.splats) != len(blob_scene.points), "nothing grew: the test is too weak"
 
 
@@ -62,13 +61,13 @@ def test_the_files_of_plain_splats_show_what_was_trained(
     method: str, blob_scene: Scene, trained: SplatModel, tmp_path: Path
 ) -> None:
     given = train(blob_scene, quick(method), method=method, splats=trained, output=tmp_path, device="cpu")
-    assert torch.equal(given.splats.dc, trained.splats.dc), "splats that were given are not trained"
+    assert np.array_equal(given.splats.dc, trained.splats.dc), "splats that were given are not trained"
     path = tmp_path / f"a{METHODS[method].suffix}"
     assert write(given, path, method=method) == path.stat().st_size < 60 * len(trained.splats)
     again = open_scene(path)
     camera = blob_scene.test_views[0].camera
     difference = render(again, camera).image - render(trained, camera).image
-    assert again.counts == trained.counts and difference.abs().mean() < 0.01
+    assert again.counts == trained.counts and np.abs(difference).mean() < 0.01
     _, metadata = read_checkpoint_file(tmp_path / "checkpoint.safetensors", method)
     assert metadata["method"] == method
 
@@ -85,10 +84,10 @@ def test_a_method_with_hooks_phases_and_a_container_shows_what_it_trained(
     assert write(result, path, method="toy") == path.stat().st_size == sum(component_bytes(path).values())
     assert component_bytes(path)["labels"] <= -(-3 * len(model.splats) // 8)
     opened = open_scene(path, background=model.background)
-    assert isinstance(opened, SplatModel) and len(opened.splats.dc.unique(dim=0)) <= 8
+    assert isinstance(opened, SplatModel) and len(np.unique(opened.splats.dc, axis=0)) <= 8
     camera = blob_scene.test_views[0].camera
     drawn = replace(model, splats=replace(model.splats, dc=colors.palette.detach()[colors.labels]))
-    assert torch.equal(render(opened, camera).image, render(drawn, camera).image)
+    assert np.array_equal(render(opened, camera).image, render(drawn, camera).image)
 
 
 @pytest.mark.parametrize("stop", [20, 40, 50])
@@ -129,7 +128,7 @@ def test_splats_take_the_place_of_the_first_phase(
     write_ply(trained.splats, file)
     model, colors = train(blob_scene, quick("toy"), method="toy", splats=file, device="cpu")
     assert len(model.splats) == len(trained.splats) == len(colors.labels)
-    moved = (model.splats.means - trained.splats.means).abs()
+    moved = np.abs(model.splats.means - trained.splats.means)
     assert 0 < moved.max() < 0.01
 
 

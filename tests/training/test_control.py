@@ -8,7 +8,7 @@ import torch
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig, load_config
 from compgs.gaussians import Gaussians
-from compgs.model.prediction import Prediction
+from compgs.tensors.prediction import Prediction
 from compgs.trained_model import TrainedModel
 from compgs.training import target_size
 from compgs.training.control import AdaptiveControl, ControlSchedule, make_schedule, new_cells, rate_weight
@@ -102,10 +102,23 @@ def test_the_schedule_scales_with_the_run(tiny_config):
 
 
 def test_statistics_follow_the_anchors(blob_scene, tiny_config):
+    """Through pruning: those that stay keep theirs, row by row."""
     model = initial_model(blob_scene, tiny_config)
-    control = AdaptiveControl(tiny_config, make_schedule(tiny_config.control, 40, 8), model.anchors, CPU)
-    assert control.gradient.shape == (model.anchors, 4)
-    assert make_optimizer(model, tiny_config.training).param_groups[0]["name"] == "log_scales"
+    n, k = model.anchors, 4
+    control = AdaptiveControl(tiny_config, make_schedule(tiny_config.control, 40, 8), n, CPU)
+    filled = {
+        "gradient": torch.arange(n * k, dtype=torch.float32).view(n, k),
+        "drawn": torch.arange(n * k, dtype=torch.float32).view(n, k) + 0.25,
+        "opacity": torch.arange(n, dtype=torch.float32) + 0.5,
+        "seen": torch.arange(n, dtype=torch.float32) + 0.75,
+    }
+    for name, values in filled.items():
+        setattr(control, name, values.clone())
+    kept = torch.rand(n, generator=torch.Generator().manual_seed(0)) < 0.6
+    control.keep(model, make_optimizer(model, tiny_config.training), kept)
+    assert model.anchors == int(kept.sum()) < n
+    for name, values in filled.items():
+        assert torch.equal(getattr(control, name), values[kept]), name
 
 
 # the schedule ------------------------------------------------------------------------------------------------------

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from compgs.model.constants import CUTOFF_SIGMAS
-from compgs.model.prediction import camera_center, predict
-from compgs.render import rasterize, visible_mask
+from compgs.tensors.prediction import camera_center, predict
+from compgs.tensors.rasterize import rasterize
+from compgs.tensors.visibility import visible_mask
 from compgs.training.culling import EVERY, MARGIN, AnchorBounds
 from compgs.training.trainer import Trainer
 
@@ -68,7 +69,7 @@ def test_measurements_are_frequent_at_first():
 
 
 def test_nothing_that_a_decoder_draws_is_left_out(trained):
-    centers, radii = trained.model.as_hybrid_model(stored_weights=False).bounds
+    centers, radii = map(torch.from_numpy, trained.model.as_hybrid_model(stored_weights=False).bounds)
     for view in trained.scene.train_views:
         drawn = visible_mask(centers, radii, view.camera, trained.settings)
         looked_at = torch.zeros_like(drawn)

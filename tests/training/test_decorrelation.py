@@ -15,6 +15,7 @@ from compgs.training.decorrelation import (
     channel_rates,
     decorrelate,
     drop_silent_channels,
+    keep_channels,
     principal_axes,
 )
 from compgs.training.trainer import Trainer
@@ -200,7 +201,26 @@ def test_a_file_of_fewer_channels_decodes_to_the_trained_latents(
     decoded = decode(tmp_path / "scene.cgs").primitives.references
     expected = trainer.model.primitives(trainer.model.quantized()).references
     assert decoded.shape == expected.shape == (trainer.model.anchors, tiny_config.model.reference_dim - 3)
-    torch.testing.assert_close(decoded.sort(0).values, expected.sort(0).values, atol=1e-3, rtol=0)
+    np.testing.assert_allclose(np.sort(decoded, 0), np.sort(expected.detach(), 0), atol=1e-3, rtol=0)
+
+
+def test_the_channels_that_stay_keep_their_means_and_scales(blob_scene: Scene, tiny_config: Config) -> None:
+    """Of the references themselves: the hyperprior's network has the means of all channels, then all scales."""
+    trainer = trained(blob_scene, tiny_config, steps=8)
+    model, network = trainer.model, trainer.model.entropy.reference_network
+    kept = torch.tensor([False, True, False, True, True, True, True, True])
+    z = torch.randn(20, tiny_config.entropy.reference_hyper_dim, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        before = network(z)
+        references = model.references.detach().clone()
+        moments = trainer.optimizer.state[network.weights[-1]]["exp_avg"].clone()
+        keep_channels(model, kept, trainer.optimizer)
+        after = network(z)
+    for old, new in zip(before, after, strict=True):
+        torch.testing.assert_close(new, old[:, kept])
+    assert torch.equal(model.references.detach(), references[:, kept])
+    rows = torch.cat([kept, kept])
+    assert torch.equal(trainer.optimizer.state[network.weights[-1]]["exp_avg"], moments[rows])
 
 
 def test_one_channel_stays_when_none_says_anything(blob_scene: Scene, tiny_config: Config) -> None:

@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from compgs.config import Config, load_config
-from compgs.model import HeadDimensions, make_heads, predict
+from compgs.model import HeadDimensions
 from compgs.scene.points import colors_at
 from compgs.scene.views import Scene
+from compgs.tensors.heads import make_heads
+from compgs.tensors.prediction import predict
 from compgs.training.initial import initial_model
 
 

@@ -6,12 +6,14 @@ import torch
 
 from compgs.config import Config, SplatConfig, TrainingConfig
 from compgs.errors import CheckpointError, ConfigError, TrainingError
-from compgs.formats import arrays_of, encoded
+from compgs.formats import encoded
 from compgs.gaussians import Gaussians
 from compgs.metrics import psnr, to_8bit
-from compgs.model.splats import SplatModel, Splats
-from compgs.render import RasterSettings, rasterize, render
+from compgs.model.splats import SplatModel
+from compgs.render import RasterSettings, render
 from compgs.scene.views import Points
+from compgs.tensors.rasterize import rasterize
+from compgs.tensors.splats import Splats
 from compgs.training import SplatTrainer, Trainer, train_splats
 from compgs.training.checkpoint import load_checkpoint
 from compgs.training.densification import DensifySchedule
@@ -34,11 +36,11 @@ SCHEDULE = DensifySchedule(start=8, stop=45, every=10, reset_every=15)
 
 
 def ply_bytes(splats: Splats) -> bytes:
-    return encoded(arrays_of(splats), "ply")
+    return encoded(splats.arrays(), "ply")
 
 
 def file_of(model) -> bytes:
-    return ply_bytes(model.splats)
+    return encoded(model.splats, "ply")
 
 
 def test_the_same_seed_gives_the_same_file_and_another_seed_another(blob_scene, config):
@@ -105,7 +107,7 @@ def test_training_shows_the_held_out_view_and_a_late_reset_does_not_spoil_it(blo
     (view,) = blob_scene.test_views
     flat = np.broadcast_to(view.image.mean((0, 1)).round().astype(np.uint8), view.image.shape)
     trainer.run(None, None)
-    model = SplatModel(trainer.parameters.trained(), blob_scene.background)
+    model = SplatModel(trainer.parameters.trained().arrays(), blob_scene.background)
     assert psnr(to_8bit(render(model, view.camera).image), view.image) > 8 + psnr(flat, view.image)
 
 

@@ -126,6 +126,8 @@ def print_results(results: "Results") -> None:
         warn(in_words_of_options(note))
     say(f"{results.file} on {results.scene}: {views}, {results.device}, {results.threads} threads")
     console.print(table)
+    if results.exposure is not None:
+        say(results.exposure)
     console.print()
     counts = {
         "bits/anchor": results.anchors,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileOrRunArgument, SceneOptions
+from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileOrRunArgument, SceneOptions
 from compgs.cli.console import duration, say
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import RunSettings, SceneSource, file_and_run
@@ -31,7 +31,7 @@ VIDEO_BYTES = 16 << 20  # that must be free for a video; a long one fails later
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(ComputingCommand, SceneOptions, SceneFileOrRunArgument):
+class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
     """Render images or a video from a file of splats: views of a scene, cameras of a JSON file, or a way through it.
 
     A camera file is a list of objects with world_to_camera (4 x 4, OpenCV axes), fx, fy, cx, cy, width and
@@ -109,13 +109,12 @@ class Render(ComputingCommand, SceneOptions, SceneFileOrRunArgument):
             raise UsageError("both a scene and --cameras were given; give one")
         keyframes = self.keyframes()
         self.prepare()
-        import torch
+        from compgs.devices import chosen_device
 
         source = self.views_source(run)
         scene = read_scene(source) if source else None
         views = self.given_views(scene)
-        device = self.device or ("cuda" if torch.cuda.is_available() else "cpu")
-        model = open_scene(file, device, scene.background if scene else BLACK)
+        model = open_scene(file, chosen_device(self.device), scene.background if scene else BLACK)
         if self.background is not None:
             model = model.over(self.background)
         self.render(model, views or self.way(model, keyframes))
@@ -206,7 +205,7 @@ class Render(ComputingCommand, SceneOptions, SceneFileOrRunArgument):
         from compgs.evaluation.camera_path import orbit
 
         circle = orbit(
-            model.bounds[0].cpu().numpy(),
+            model.bounds[0],
             frames=self.frames,
             width=self.width,
             height=self.height,

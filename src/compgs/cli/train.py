@@ -3,6 +3,8 @@
 import json
 import shlex
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,11 +29,14 @@ from compgs.cli.scenes import read_scene
 from compgs.cli.settings import check_settings_of, with_settings
 from compgs.cli.sizes import parse_cameras, parse_size
 from compgs.cli.usage import UsageError, settings_of_options
+from compgs.cli.viewing import check_viewing, viewing
 from compgs.errors import MissingSparseModel
+from compgs.extras import require
 from compgs.methods import METHODS, Method, settings_of, train
 from compgs.outputs import check_output_folder, write_json
 
 if TYPE_CHECKING:
+    from compgs.cli.viewing import Viewing
     from compgs.scene import Scene
     from compgs.training import TrainingStatus
 
@@ -65,6 +70,8 @@ class Train(ComputingCommand, SceneOptions):
     compgs train scenes/garden -o runs/two --target-size 2MB
 
     compgs train scenes/garden -o runs/garden-3dgs --method 3dgs
+
+    compgs train scenes/garden -o runs/garden --viewer
 
     compgs train -o runs/garden --resume
     """
@@ -129,6 +136,16 @@ class Train(ComputingCommand, SceneOptions):
     lpips: FlagCreatePairsOff[bool] = False
     """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
 
+    viewer: FlagCreatePairsOff[bool] = False
+    """Show the scene as it grows, in the browser, for less than a tenth of the training's speed; what comes out is the
+    same (needs `pip install '.[view]'` in the project's folder)."""
+
+    viewer_host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address at which the viewer listens; 0.0.0.0 is all addresses of this machine."""
+
+    viewer_port: Annotated[int, arg(metavar="N")] = 8080
+    """Port at which it listens; 0 takes a free one."""
+
     def run(self) -> None:
         if self.output is None:
             raise UsageError(
@@ -136,25 +153,41 @@ class Train(ComputingCommand, SceneOptions):
             )
         if self.resume and self.overwrite:
             raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
+        require("train", "training")
         folder = self.output
         check_output_folder(folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES)
         settings = self.settings(folder)
-        self.prepare()
+        self.prepare_training()
         if self.lpips:
             check_lpips()
+        if self.viewer:
+            check_viewing(self.viewer_port, "--viewer-port")
         if self.resume:
             say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
         scene, settings = self.read(settings)
-        with beginning(folder, settings, anew=not self.resume) as earlier:
-            model = self.train(scene, settings, folder, earlier)
+        with (
+            self.viewing(scene, folder.name) as viewing,
+            beginning(folder, settings, anew=not self.resume) as earlier,
+        ):
+            model = self.train(scene, settings, folder, earlier, viewing)
         method = METHODS[settings.method]
         path = folder / file_name(folder, method.suffix)
         start = time.perf_counter()
         written = method.write(model, path, settings.config)
         say(f"{path}: {size(written)}, written in {duration(time.perf_counter() - start)}")
-        self.evaluate(scene, path, folder, settings.method)
+        self.evaluate(scene, path, folder, settings)
         if settings.config.training.target_bytes is not None:
             say_miss(folder, settings.config.training.target_bytes)
+
+    @contextmanager
+    def viewing(self, scene: "Scene", title: str) -> "Iterator[Viewing | None]":
+        """Where the training is looked at, if it is to be. Raises UsageError."""
+        if not self.viewer:
+            yield None
+            return
+        with viewing(scene, title, self.viewer_host, self.viewer_port) as view:
+            say(f"the scene as it grows: {view.address}")
+            yield view
 
     def read(self, settings: RunSettings) -> tuple["Scene", RunSettings]:
         """The scene; where there are photographs without poses, of those that are found if the user agrees."""
@@ -235,10 +268,18 @@ class Train(ComputingCommand, SceneOptions):
         }
         return (*(f"{name}={value}" for name, value in named.items() if value is not None), *self.set)
 
-    def train(self, scene: "Scene", settings: RunSettings, folder: Path, earlier: EarlierRun | None) -> Any:
+    def train(
+        self,
+        scene: "Scene",
+        settings: RunSettings,
+        folder: Path,
+        earlier: EarlierRun | None,
+        viewing: "Viewing | None",
+    ) -> Any:
         """The method's model. Raises KeyboardInterrupt, with what to do next, when the user stops it."""
-        from compgs.training import StepProfile
+        from compgs.training import History, StepProfile
 
+        history = History()
         profile = StepProfile() if self.profile else None
         last: TrainingStatus | None = None
         continues = self.continues(folder)
@@ -249,9 +290,12 @@ class Train(ComputingCommand, SceneOptions):
                 def on_progress(status: "TrainingStatus") -> None:
                     nonlocal last
                     last = status
+                    history.add(status)
                     if earlier is not None:
                         earlier.look()
                     show(status)
+                    if viewing is not None:
+                        viewing.tell(status)
 
                 model = train(
                     scene,
@@ -263,6 +307,7 @@ class Train(ComputingCommand, SceneOptions):
                     on_progress=on_progress,
                     device=self.device,
                     profile=profile,
+                    watch=viewing,
                 )
         except KeyboardInterrupt as stop:
             if earlier is not None:
@@ -282,6 +327,7 @@ class Train(ComputingCommand, SceneOptions):
                     "seconds_per_step": last.seconds_per_step,
                     "resumed": continues,
                     **({"milliseconds_per_step": profile.milliseconds()} if profile else {}),
+                    "curve": history.curve(),
                 },
             )
         say(f"trained in {duration(seconds)}")
@@ -289,7 +335,7 @@ class Train(ComputingCommand, SceneOptions):
             print_profile(profile.milliseconds())
         return model
 
-    def evaluate(self, scene: "Scene", file: Path, folder: Path, method: str) -> None:
+    def evaluate(self, scene: "Scene", file: Path, folder: Path, settings: RunSettings) -> None:
         if not scene.test_views:
             say("no views are held out (--no-eval): the file was not evaluated")
             return
@@ -304,7 +350,8 @@ class Train(ComputingCommand, SceneOptions):
                 lpips=self.lpips,
                 device=self.device,
                 progress=progress,
-                method=method,
+                method=settings.method,
+                exposure=settings.config.training.exposure,
             )
         say("")
         print_results(results)

@@ -40,17 +40,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
-import torch
 
 from compgs import __version__, metrics
 from compgs.cameras import Camera
+from compgs.devices import chosen_device, device_name
 from compgs.errors import SceneError, UnsupportedCamera
 from compgs.evaluation.camera_path import camera_entry, read_cameras, surround
-from compgs.evaluation.measure import device_name, encode_png, timed_decode, timed_render
+from compgs.evaluation.measure import encode_png, timed_decode, timed_render
 from compgs.evaluation.reports.comparison_page import ComparisonPage
 from compgs.evaluation.reports.pictures import difference_picture, levels_between, scale_for
 from compgs.formats import check_scene, component_bytes, format_of
@@ -60,6 +60,9 @@ from compgs.outputs import check_output_folder, filling, write_bytes, write_json
 from compgs.render import Renderable
 from compgs.scene import as_scene
 from compgs.scene.views import Scene, View
+
+if TYPE_CHECKING:
+    from compgs.devices import Device
 
 SCHEMA = "compgs comparison 1"
 PAGE_NAME = "comparison.html"
@@ -196,7 +199,7 @@ def compare(
     background: Background | None = None,
     output: str | Path | None = None,
     overwrite: bool = False,
-    device: str | torch.device | None = None,
+    device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
     """Open two files of any known formats (`compgs.formats`) and compare what they show.
@@ -219,7 +222,7 @@ def compare(
         raise SceneError("a scene and cameras were both given; give one")
     if output is not None:
         check_output_folder(Path(output), overwrite=overwrite)
-    chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    chosen = chosen_device(device)
     read = None if scene is None else as_scene(scene)
     sides, notes = _opened(paths, chosen, read, background)
     places, origin = _places(sides, read, cameras)
@@ -260,7 +263,7 @@ class _Place:
 
 
 def _opened(
-    paths: tuple[Path, Path], device: torch.device, scene: Scene | None, background: Background | None
+    paths: tuple[Path, Path], device: str, scene: Scene | None, background: Background | None
 ) -> tuple[tuple[_Side, _Side], tuple[str, ...]]:
     """Both files, over one background and in one place; and what was decided for that."""
     behind = background or (scene.background if scene else (0.0, 0.0, 0.0))
@@ -279,7 +282,7 @@ def _opened(
     for i, (model, other) in enumerate(zip(models, models[::-1], strict=True)):
         if _counts_from_the_other(model, other):
             assert isinstance(model, SplatModel)
-            models[i] = replace(model, world_offset=other.world_offset)
+            models[i] = model.at(other.world_offset)
             place = " ".join(f"{x:.12g}" for x in other.world_offset)
             notes.append(f"{paths[i].name} does not say where its positions count from: taken as {place}")
     one, two = (replace(side, model=model) for side, model in zip(opened, models, strict=True))
@@ -290,7 +293,7 @@ def _counts_from_the_other(model: Renderable, other: Renderable) -> bool:
     """Splats whose positions are those of the other's local frame, which most formats have no place to say."""
     if not isinstance(model, SplatModel) or any(model.world_offset) or not any(other.world_offset):
         return False
-    middle, others = (m.bounds[0].double().median(0).values.cpu().numpy() for m in (model, other))
+    middle, others = (np.median(m.bounds[0].astype(np.float64), 0) for m in (model, other))
     world = others + np.array(other.world_offset)
     return bool(np.linalg.norm(middle - others) < np.linalg.norm(middle - world))
 
@@ -319,7 +322,7 @@ def _places(
                 _Place(f"camera {i}", camera, None) for i, camera in enumerate(kept)
             ], f"cameras that {side.path.name} keeps"
     model = sides[0].model
-    around = surround(model.bounds[0].cpu().numpy())[::AROUND_EVERY]
+    around = surround(model.bounds[0])[::AROUND_EVERY]
     back = -np.array(model.world_offset)
     return [_Place(name, camera.moved(back), None) for name, camera in around], "cameras around the scene"
 
@@ -330,7 +333,7 @@ def _compared(
     origin: str,
     scene: Scene | None,
     notes: tuple[str, ...],
-    device: torch.device,
+    device: str,
     progress: Callable[[int, int], None] | None,
     keep: Callable[[ComparedView, dict[str, np.ndarray]], None] | None = None,
 ) -> Comparison:

@@ -20,6 +20,7 @@
 | render_seconds | median over the views, after one view to warm up |
 | device, threads | where it ran |
 | sha256 | of the file |
+| exposure | null, or how renderings got the exposure of their photographs, and what was measured then |
 | notes | sentences: in what the scene is not what the file was trained on, as far as the file's cameras tell |
 
 `per_view.json`: a list in the views' order with `name`, `file` (of `test/renders` and `test/gt`), `psnr`,
@@ -68,6 +69,7 @@ class Results:
     lpips_note: str | None  # why there is no LPIPS
     method: str | None  # that wrote the file, where it is known
     per_view: tuple[ViewResult, ...]
+    exposure: str | None = None  # how renderings got that of their photographs; None: they did not
     notes: tuple[str, ...] = ()  # in what the scene is not what the file was trained on (`evaluation/fit.py`)
 
     @property
@@ -132,6 +134,7 @@ class Results:
             "device": self.device,
             "threads": self.threads,
             "sha256": self.sha256,
+            "exposure": self.exposure,
             "notes": list(self.notes),
         }
 

@@ -76,7 +76,9 @@ def _legs(centers: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """What each leg takes, above 0: its share of all distances and its share of all turning."""
     moved = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     turned = np.arccos(np.clip((rotations[:-1] * rotations[1:]).sum(axis=1), -1.0, 1.0))
-    shares = sum(part / part.sum() for part in (moved, turned) if part.sum() > 0)
+    moved[moved <= 1e-12 * np.abs(centers).max()] = 0.0  # rounding errors
+    turned[turned <= 1e-6] = 0.0
+    shares = sum((part / part.sum() for part in (moved, turned) if part.any()), np.zeros(len(moved)))
     return np.maximum(shares, 1e-9)
 
 
@@ -139,16 +141,19 @@ def _slerp(a: np.ndarray, b: np.ndarray, part: float) -> np.ndarray:
 def _between(points: np.ndarray, leg: int, part: float, closed: bool) -> np.ndarray:
     """On the spline through the points, `part` of the way from one to the next (Barry and Goldman 1988)."""
     n = len(points) - 1
-    before = points[(leg - 1) % n] if closed else points[max(leg - 1, 0)]
-    after = points[(leg + 2) % n] if closed else points[min(leg + 2, n)]
+    if not closed:  # beyond its ends it goes straight on, so that it neither starts nor stops slowly
+        points = np.concatenate([2 * points[:1] - points[1:2], points, 2 * points[-1:] - points[-2:-1]])
+        leg, n = leg + 1, n + 3
+    before, after = points[(leg - 1) % n], points[(leg + 2) % n]
     p = [before, points[leg], points[leg + 1], after]
     knots = [0.0]
     for a, b in itertools.pairwise(p):
         knots.append(knots[-1] + max(float(np.linalg.norm(b - a)) ** 0.5, 1e-12))
     t = knots[1] + part * (knots[2] - knots[1])
     for level in range(1, 4):
+        # As a step from one point: exact where two are in one place, and far from the origin.
         p = [
-            ((knots[i + level] - t) * p[i] + (t - knots[i]) * p[i + 1]) / (knots[i + level] - knots[i])
+            p[i] + (t - knots[i]) / (knots[i + level] - knots[i]) * (p[i + 1] - p[i])
             for i in range(4 - level)
         ]
     return p[0]

@@ -11,7 +11,7 @@
 | .packed, of a method of the comparison | yes | by `compgs.methods.write` | |
 """
 
-from compgs.formats.arrays import SplatArrays, arrays_of
+from compgs.formats.arrays import SplatArrays
 from compgs.formats.ply import read_ply, write_ply
 from compgs.formats.registry import (
     FORMATS,
@@ -30,7 +30,6 @@ __all__ = [
     "WRITERS",
     "Format",
     "SplatArrays",
-    "arrays_of",
     "check_scene",
     "component_bytes",
     "encoded",

@@ -26,13 +26,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from compgs.devices import placed
 from compgs.errors import SplatFileError
 from compgs.formats.arrays import SplatArrays, checked
 from compgs.outputs import write_bytes
 
 if TYPE_CHECKING:
-    import torch
-
+    from compgs.devices import Device
     from compgs.model.splats import SplatModel
 
 SUFFIX = ".packed"
@@ -191,15 +191,14 @@ def component_bytes(path: Path) -> dict[str, int]:
 
 
 def splat_model(
-    packed: Packed, arrays: SplatArrays, device: "torch.device | str", background: tuple[float, float, float]
+    packed: Packed, arrays: SplatArrays, device: "Device", background: tuple[float, float, float]
 ) -> "SplatModel":
     """Splats that a method made of a file. Raises SplatFileError for what nothing can be rendered from."""
     from compgs.model.splats import SplatModel
 
     if not len(arrays):
         raise SplatFileError(f"{packed.path}: holds no splats")
-    splats = checked(packed.path, arrays).splats().to(device)
-    return SplatModel(splats, background, arrays.world_offset)
+    return placed(SplatModel(checked(packed.path, arrays), background), device)
 
 
 def _header(path: Path, data: bytes) -> tuple[dict[str, Any], list[_Entry]]:

@@ -34,7 +34,7 @@ where it is used. This is a whole method, which trains splats with three bits of
         return train_phases(scene, (Phase(config), tuned), run, start).model()
 
     def write(model, path, config):
-        arrays = arrays_of(model.splats, model.world_offset)
+        arrays = model.splats
         ...
         return write_packed(path, Packed("coarse", {"levels": config.coarse.levels}, {"colors": indices, ...}))
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from compgs.config import Config
 
 if TYPE_CHECKING:
-    import torch
-
+    from compgs.devices import Device
     from compgs.formats.packed import Packed
     from compgs.model.splats import SplatModel
     from compgs.render.render_model import Renderable
@@ -22,6 +21,7 @@ SPLAT_SETTINGS = (
     "training.steps",
     "training.seed",
     "training.ssim_weight",
+    "training.exposure",
     "training.checkpoint_minutes",
 )
 Presets = Mapping[str, Mapping[str, Mapping[str, Any]]]
@@ -48,7 +48,7 @@ class Method:
     # Writes it whole or not at all, replacing what is there; the number of bytes. Raises OutputError.
     write: Callable[[Any, Path, Any], int]  # what was trained, path, settings
     # Opens the method's own container, where it has one; other files are known by their format. Raises SplatFileError.
-    open: "Callable[[Packed, torch.device | str, tuple[float, float, float]], Renderable] | None" = None
+    open: "Callable[[Packed, Device, tuple[float, float, float]], Renderable] | None" = None
     settings: type[Config] = Config  # or a dataclass derived from it, with a section of the method's own
     # Its own, beside those of `compgs.config`: what differs from the default, by section and name.
     presets: Presets = field(default_factory=dict)

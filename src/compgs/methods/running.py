@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 from compgs.config import PRESETS, Config, check_config, config_from_dict, load_config
 from compgs.errors import ConfigError
+from compgs.extras import require
 from compgs.methods.method import Method
 
 if TYPE_CHECKING:
-    import torch
-
+    from compgs.devices import Device
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.loop import TrainingStatus
+    from compgs.training.loop import TrainingStatus, Watch
     from compgs.training.profile import StepProfile
 
 
@@ -48,8 +48,9 @@ def train(
     output: str | Path | None = None,
     resume: bool = False,
     on_progress: "Callable[[TrainingStatus], None] | None" = None,
-    device: "str | torch.device | None" = None,
+    device: "Device | None" = None,
     profile: "StepProfile | None" = None,
+    watch: "Watch | None" = None,
 ) -> Any:
     """Train a scene, or the one in a folder, by a method; the result can be rendered, and written by
     `compgs.methods.write` (of `compgs`, also by `compgs.encode`).
@@ -58,11 +59,13 @@ def train(
     `output`, a folder, checkpoints are written there, also when the run is interrupted; `resume` continues from the
     last one exactly as if the run had not stopped (`compgs train --resume` cannot: it does not know how the scene was
     read). `splats`, or a file of them, take the place of the plain 3DGS that a method begins with. `profile` gathers
-    where the time goes. Default device: CUDA where there is one.
+    where the time goes. `watch(trainer)` is called between any two steps: `trainer.snapshot()` can be rendered. Default
+    device: CUDA where there is one.
 
-    Raises ConfigError, CheckpointError, OutputError, SplatFileError, and TrainingError when the optimization cannot go
-    on.
+    Raises ConfigError (without torch MissingDependency), CheckpointError, OutputError, SplatFileError, and
+    TrainingError when the optimization cannot go on.
     """
+    require("train", "training")
     from compgs.scene import as_scene
     from compgs.training.loop import Run
 
@@ -72,7 +75,15 @@ def train(
         raise ConfigError(f"splats: method {method} does not begin with plain 3DGS; leave them out")
     read = as_scene(scene)
     start = opened_splats(splats, read) if isinstance(splats, (str, Path)) else splats
-    run = Run(method, output=output, resume=resume, on_progress=on_progress, device=device, profile=profile)
+    run = Run(
+        method,
+        output=output,
+        resume=resume,
+        on_progress=on_progress,
+        device=device,
+        profile=profile,
+        watch=watch,
+    )
     return known.train(read, chosen, run, start)
 
 

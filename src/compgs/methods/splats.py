@@ -39,10 +39,10 @@ def _train_near(
 
 def _writes(suffix: str) -> "Callable[[SplatModel, Path, Config], int]":
     def write(model: "SplatModel", path: Path, config: "Config") -> int:
-        from compgs.formats import arrays_of, encoded
+        from compgs.formats import encoded
         from compgs.outputs import write_bytes
 
-        data = encoded(arrays_of(model.splats, model.world_offset), suffix.removeprefix("."))
+        data = encoded(model.splats, suffix.removeprefix("."))
         write_bytes(path, data)
         return len(data)
 

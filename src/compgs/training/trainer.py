@@ -23,11 +23,19 @@ from compgs.losses import (
     scale_regularizer,
     scale_unit,
 )
-from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict, predict_geometry
-from compgs.render import RasterResult, RasterSettings, visible_mask
+from compgs.model.hybrid_model import HybridModel
+from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
+from compgs.tensors.prediction import (
+    Prediction,
+    camera_center,
+    choosing_pays,
+    predict,
+    predict_geometry,
+)
+from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
 from compgs.training.checkpoint import (
     Checkpoint,
@@ -49,6 +57,7 @@ from compgs.training.loop import (
     Run,
     StepResult,
     TrainingStatus,
+    Watch,
     chosen_config,
     diverged,
     rasterize_step,
@@ -57,6 +66,7 @@ from compgs.training.loop import (
 from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rates, step_rows
 from compgs.training.profile import StepProfile
 from compgs.training.rate_control import RateState
+from compgs.training.restoring import check_tensor, restore_chance, restore_statistics, restoring
 from compgs.training.seen_points import check_points_seen
 from compgs.training.target_size import TargetSize, pruned_share
 from compgs.training.views_in_turn import ViewsInTurn
@@ -99,7 +109,7 @@ def train_hybrid(scene: Scene, config: Config, run: Run) -> TrainedModel:
         trainer = Trainer(scene, config, run.device)
     if run.profile is not None:
         run.profile.watch(trainer, PARTS, stations)
-    trainer.run(run.checkpoint, run.on_progress)
+    trainer.run(run.checkpoint, run.on_progress, run.watch)
     return trainer.model
 
 
@@ -112,7 +122,7 @@ class Trainer:
         self, scene: Scene, config: Config, device: torch.device, model: TrainedModel | None = None
     ) -> None:
         t, views = config.training, len(scene.train_views)
-        self.views = ViewsInTurn(scene, device, t.seed + 2)
+        self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure)
         self.config = config
         self.device = device
         self.model = (model or initial_model(scene, config)).to(device)
@@ -241,6 +251,7 @@ class Trainer:
         if rates is not None:
             references.copy_(before.lerp_(references, rates))
         self.optimizer.zero_grad(set_to_none=True)
+        self.views.learn(self.progress)
 
     def observe(self, rows: Tensor, prediction: Prediction, rendered: RasterResult, camera: Camera) -> None:
         """The statistics that growth and pruning go by."""
@@ -313,10 +324,19 @@ class Trainer:
 
     # the run -------------------------------------------------------------------------------------------------------
 
-    def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
+    def run(
+        self,
+        path: Path | None,
+        on_progress: Callable[[TrainingStatus], None] | None,
+        watch: Watch | None = None,
+    ) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         check_points_seen(self.scene, self.settings.near_plane)
-        run_to_end(self, self.config.training, path, on_progress)
+        run_to_end(self, self.config.training, path, on_progress, watch)
+
+    def snapshot(self) -> HybridModel:
+        """What the file would hold of the scene now, but for primitives that the end of the run removes."""
+        return self.model.as_hybrid_model(stored_weights=self.stored)
 
     @property
     def primitives(self) -> int:
@@ -346,6 +366,7 @@ class Trainer:
     def save(self, path: Path) -> None:
         extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
         extra["chance"] = self.chance.get_state()
+        extra |= self.views.tensors()
         if self.reference_rates is not None:
             extra["reference_rates"] = self.reference_rates
         if self.bounds.measured is not None:
@@ -362,19 +383,24 @@ class Trainer:
     def resumed(cls, scene: Scene, path: Path, config: Config, device: torch.device) -> "Trainer":
         """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
         checkpoint = load_checkpoint(path)
-        check_same_run(checkpoint.model.config, config, checkpoint.state["views"], scene)
+        with restoring(path):
+            check_same_run(checkpoint.model.config, config, checkpoint.state["views"], scene)
         trainer = cls(scene, config, device, checkpoint.model)
-        restore_optimizer(dict(trainer.model.named_parameters()), trainer.optimizer, checkpoint.optimizer)
-        for name in AdaptiveControl.STATISTICS:
-            setattr(trainer.control, name, checkpoint.extra[f"control/{name}"].to(device))
-        if "reference_rates" in checkpoint.extra:
-            trainer.reference_rates = checkpoint.extra["reference_rates"].to(device)
-        if "bounds" in checkpoint.extra:
-            trainer.bounds.measured = checkpoint.extra["bounds"].to(device)
-        trainer.chance.set_state(checkpoint.extra["chance"])
-        trainer.views.restore(checkpoint.state)
-        trainer.step = checkpoint.state["step"]
-        trainer.rate = RateState(**checkpoint.state["rate"])
+        with restoring(path):
+            restore_optimizer(dict(trainer.model.named_parameters()), trainer.optimizer, checkpoint.optimizer)
+            restore_statistics(trainer.control, AdaptiveControl.STATISTICS, checkpoint.extra)
+            if any(at < checkpoint.state["step"] for at in trainer.decorrelated_at):
+                rates = checkpoint.extra["reference_rates"]
+                check_tensor(rates, (trainer.model.reference_dim,), torch.float32, "reference_rates")
+                trainer.reference_rates = rates.to(device)
+            if "bounds" in checkpoint.extra:
+                bounds = checkpoint.extra["bounds"]
+                check_tensor(bounds, (trainer.model.anchors,), torch.float32, "bounds")
+                trainer.bounds.measured = bounds.to(device)
+            restore_chance(trainer.chance, checkpoint.extra)
+            trainer.views.restore(checkpoint.state, checkpoint.extra)
+            trainer.step = checkpoint.state["step"]
+            trainer.rate = RateState.restored(checkpoint.state["rate"])
         return trainer
 
 

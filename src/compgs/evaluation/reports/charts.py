@@ -20,7 +20,7 @@ PALETTE = (
 )
 MARKERS = ("circle", "square", "triangle", "diamond")
 WIDTH, HEIGHT = 480, 320  # units of the drawing
-LEFT, RIGHT, TOP, BOTTOM = 62, 14, 12, 46  # margins
+LEFT, RIGHT, TOP, BOTTOM = 72, 14, 12, 46  # margins
 TICKS = 6  # about as many on an axis
 MARGIN = 0.06  # of an axis' length, beside the outermost points
 
@@ -71,11 +71,25 @@ def line_chart(series: Sequence[Series], x: Axis, y: Axis) -> str:
     return _svg(parts, WIDTH, HEIGHT, f"{y.label} over {x.label}")
 
 
-def legend(series: Sequence[Series]) -> str:
-    """What the colors and markers mean."""
+def size(count: float) -> str:
+    """Bytes with three digits: `900 B`, `20 kB`, `1.54 MB` (powers of 1000)."""
+    for factor, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        # What would be rounded to 1000 kB is 1 MB.
+        if count >= 0.9995 * factor:
+            return f"{float(f'{count / factor:.3g}'):g} {unit}"
+    return f"{count:.0f} B"
+
+
+def legend(series: Sequence[Series], *, squares: bool = False) -> str:
+    """What the colors and markers mean; those of bars are squares."""
     items = []
     for each in series:
-        drawn = [*_marker(each.style, 8, 8, 5)] if each.marked else [_stroke([(1, 8), (15, 8)], each.style)]
+        if squares:
+            drawn = [f'<rect x="3" y="3" width="11" height="11" fill="{color(each.style)}"/>']
+        elif each.marked:
+            drawn = _marker(each.style, 8, 8, 5)
+        else:
+            drawn = [_stroke([(1, 8), (15, 8)], each.style)]
         sign = f'<svg viewBox="0 0 16 16" width="16" height="16" aria-hidden="true">{"".join(drawn)}</svg>'
         items.append(f"<span>{sign} {html.escape(each.name)}</span>")
     return f'<p class="legend">{"".join(items)}</p>\n'
@@ -83,7 +97,7 @@ def legend(series: Sequence[Series]) -> str:
 
 def shares_chart(rows: Sequence[tuple[str, Sequence[float], str]], names: Sequence[str]) -> str:
     """A bar a row: its label, its parts (one for each of `names`) as shares of their sum, and a word on the right."""
-    height, gap, label, note = 20, 7, 190, 70
+    height, gap, label, note = 20, 7, 215, 70
     width = 760
     parts = []
     for i, (title, values, word) in enumerate(rows):
@@ -151,7 +165,9 @@ def _log_ticks(low: float, high: float) -> list[float]:
     ticks = [factor * 10.0**decade for decade in decades for factor in factors]
     found = [tick for tick in ticks if low <= math.log10(tick) <= high]
     # Within one step of those above: any round values.
-    return found if len(found) > 1 else [10.0**place for place in (low, (low + high) / 2, high)]
+    return (
+        found if len(found) > 1 else [10.0 ** (low + part * (high - low)) for part in (1 / 6, 1 / 2, 5 / 6)]
+    )
 
 
 def _x_axis(scale: _Scale) -> list[str]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from compgs.evaluation.reports.page import Picture, folded, heading, page, paragraph, slider
-from compgs.evaluation.reports.pictures import urls_within
+from compgs.evaluation.reports.pictures import reduced, urls_within
 from compgs.evaluation.reports.tables import Column, Table, to_html
 
 if TYPE_CHECKING:
@@ -26,7 +26,9 @@ class ComparisonPage:
 
     def keep(self, row: "ComparedView", pictures: dict[str, np.ndarray]) -> None:
         """Of one view: `a`, `b`, `difference` and perhaps `gt`, the photograph."""
-        self._kept.append(_Kept(row, pictures))
+        height, width = pictures["a"].shape[:2]
+        small = {name: reduced(picture, WIDTH) for name, picture in pictures.items()}
+        self._kept.append(_Kept(row, small, width, height))
         self._kept = sorted(self._kept, key=lambda kept: kept.row.psnr)[:SHOWN_VIEWS]
 
     def html(self, found: "Comparison") -> bytes:
@@ -55,9 +57,8 @@ class ComparisonPage:
                 for name, label in labels.items()
                 if name in url
             ]
-            height, width = kept.pictures["a"].shape[:2]
             parts.append(heading(kept.row.name, 3))
-            parts.append(slider(pictures, width, height, view_in_words(kept.row, self._names)))
+            parts.append(slider(pictures, kept.width, kept.height, view_in_words(kept.row, self._names)))
         if left:
             parts.append(paragraph(f"{left} more views are in the table below.", "note"))
         parts.append(folded("Every view in numbers", to_html(views_table(found, *self._names))))
@@ -73,7 +74,9 @@ class ComparisonPage:
 @dataclass(frozen=True, eq=False)
 class _Kept:
     row: "ComparedView"
-    pictures: dict[str, np.ndarray]  # [H, W, 3] uint8
+    pictures: dict[str, np.ndarray]  # [H, W, 3] uint8, reduced to WIDTH
+    width: int  # pixels, before
+    height: int
 
 
 def view_in_words(row: "ComparedView", names: tuple[str, str]) -> str:

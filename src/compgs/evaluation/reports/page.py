@@ -68,7 +68,7 @@ def slider(
         f'<figure class="compare">\n<div class="stages">\n<div class="stage" {shape}>\n{stack}'
         '<div class="handle" role="slider" tabindex="0" aria-label="line between the pictures" '
         'aria-valuemin="0" aria-valuemax="100" aria-valuenow="50"></div>\n</div>\n'
-        f'{beside}</div>\n<div class="choice" style="max-width:{WIDEST * width:g}px">{lists}</div>\n'
+        f'{beside}</div>\n<div class="choice">{lists}</div>\n'
         f"<figcaption>{html.escape(caption)}</figcaption>\n</figure>\n"
     )
 

@@ -15,8 +15,8 @@ LEAST_WIDTH = 96  # pixels; smaller ones show nothing
 ROOM = 0.94  # of the bytes that a reduction aims at: sizes do not quite follow the number of pixels
 BASE64 = 4 / 3  # letters for a byte
 # Ends of the scale of a picture of differences, in levels of 255; the first that is not exceeded is taken.
-SCALES = (4, 16, 64, 256)
-EXCEEDED = 0.001  # share of the pixels that may lie above a scale's end
+SCALES = (4, 8, 16, 32, 64, 128, 255)
+EXCEEDED = 0.01  # share of the pixels that may lie above a scale's end
 # Black, purple, red, orange, white: lightness rises evenly, so that it can be read in gray, too.
 COLORS = np.array([(0, 0, 0), (74, 16, 110), (190, 42, 78), (249, 150, 25), (255, 255, 240)], np.float64)
 
@@ -51,14 +51,18 @@ def difference_picture(levels: np.ndarray, scale: int) -> np.ndarray:  # [H, W, 
     return np.stack(channels, axis=2).round().astype(np.uint8)
 
 
+def reduced(image: np.ndarray, width: int) -> np.ndarray:
+    """A [H, W, 3] uint8 image, at most `width` pixels wide."""
+    if image.shape[1] <= width:
+        return image
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BOX))
+
+
 def webp(image: np.ndarray, width: int) -> bytes:
     """Of a [H, W, 3] uint8 image, at most `width` pixels wide."""
-    picture = Image.fromarray(image)
-    if picture.width > width:
-        height = max(1, round(picture.height * width / picture.width))
-        picture = picture.resize((width, height), Image.Resampling.BOX)
     buffer = io.BytesIO()
-    picture.save(buffer, format="WEBP", quality=QUALITY, method=4)
+    Image.fromarray(reduced(image, width)).save(buffer, format="WEBP", quality=QUALITY, method=4)
     return buffer.getvalue()
 
 
@@ -72,6 +76,7 @@ def urls_within(images: Sequence[np.ndarray], width: int, most_bytes: int) -> li
 
     Reduced to `width` pixels first; below LEAST_WIDTH they are not reduced further, whatever it takes.
     """
+    width = min(width, max((image.shape[1] for image in images), default=width))
     for _ in range(ROUNDS):
         encoded = [webp(image, width) for image in images]
         needed = BASE64 * sum(map(len, encoded))
