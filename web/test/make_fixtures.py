@@ -133,7 +133,7 @@ def expected(data: bytes) -> tuple[dict[str, Any], bytes]:
     drawn = _sound(values)
     arrays = [values[name][drawn].astype("<f4") for name in FIELDS]
     p = model.primitives
-    arrays.append(p.sizes[p.anchor_index[index]][drawn].astype("<f4"))
+    arrays.append(p.spread()[p.anchor_index[index], 3:][drawn].astype("<f4"))
     return {
         "hashes": hashes(content, latents),
         "prefixes": prefixes,

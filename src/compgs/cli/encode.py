@@ -134,15 +134,11 @@ class Encode(DecodingCommand, ReadingOptions):
         return self.output
 
     def encoded_run(self) -> bytes:
-        from compgs.codec.encoder import to_content
-        from compgs.codec.writer import write_content
+        from compgs.codec.encoder import encoded
         from compgs.training import load_run
 
-        model = load_run(self.source)
-        if self.cameras is not None:
-            training = replace(model.config.training, viewpoints=parse_cameras(self.cameras))
-            model.config = replace(model.config, training=training)
-        return write_content(to_content(model), self.geometry)
+        viewpoints = None if self.cameras is None else parse_cameras(self.cameras)
+        return encoded(load_run(self.source), self.geometry, viewpoints=viewpoints)[0]
 
     def reduced(self, data: bytes) -> bytes:
         from compgs.evaluation.reduction import reduce_file

@@ -62,20 +62,45 @@ def exp2_minus(q):
     return p * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
 
 
+@njit(inline="always")
+def corner(tile, width):
+    """Left column and top row of a tile of an image."""
+    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    return tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
+
+
+@njit(inline="always")
+def falloff(dx, dy, l00, l10, l11, log2_opacity):
+    """Alpha of a splat at a distance in pixels, before cutoff and cap."""
+    p, r = l00 * dx + l10 * dy, l11 * dy
+    return exp2_minus(p * p + (r * r - log2_opacity))
+
+
+@njit(inline="always")
+def pass_through(t, uncapped, cutoff, cap, stop):
+    """At a pixel of transmittance t: alpha, the weight of the splat's color, the transmittance behind the splat, and
+    whether the pixel is not finished. (Of numbers alone: with an array as argument loops would not be vectorized.)
+    """
+    alpha = min(cap, uncapped)
+    alpha = alpha if alpha >= cutoff else ZERO
+    weight = alpha * t
+    t_next = t - weight
+    open_ = t_next > stop
+    return alpha, weight if open_ else ZERO, t_next if open_ else -abs(t), open_
+
+
 @njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def blend_forward(
     packed, starts, entries, order, background, cutoff, cap, stop, image, transmittance, ends, share
 ):
     """Fills image [H, W, 3], transmittance [H, W] and, per tile, the entry after the last one needed."""
     height, width = transmittance.shape
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     tiles = starts.shape[0] - 1
     for turn in portion(turns(tiles), share):
         tile = tile_at(turn, tiles)
         if tile >= tiles:
             continue
-        tile_y, tile_x = tile // tiles_x, tile % tiles_x
-        left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
+        left, top = corner(tile, width)
         x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
         s = np.zeros(SCRATCH, np.float32)
         splats = np.empty((ENTRIES_PER_CHECK, PARAMETERS), np.float32)
@@ -92,17 +117,9 @@ def blend_forward(
                 red, green, blue = splats[j, 6], splats[j, 7], splats[j, 8]
                 first_row, last_row = spans[j] >> 8, spans[j] & 255
                 for pixel in range(U(first_row) * WIDTH, U(last_row + 1) * WIDTH):
-                    dx = x - s[pixel + COLUMN]
-                    dy = y - s[pixel + ROW]
-                    p, r = l00 * dx + l10 * dy, l11 * dy
-                    alpha = min(cap, exp2_minus(p * p + (r * r - log2_opacity)))
-                    alpha = alpha if alpha >= cutoff else ZERO
-                    t = s[pixel]
-                    weight = alpha * t
-                    t_next = t - weight
-                    open_ = t_next > stop
-                    weight = weight if open_ else ZERO
-                    s[pixel] = t_next if open_ else -abs(t)
+                    dx, dy = x - s[pixel + COLUMN], y - s[pixel + ROW]
+                    uncapped = falloff(dx, dy, l00, l10, l11, log2_opacity)
+                    _, weight, s[pixel], _ = pass_through(s[pixel], uncapped, cutoff, cap, stop)
                     s[pixel + RED] += weight * red
                     s[pixel + GREEN] += weight * green
                     s[pixel + BLUE] += weight * blue
@@ -158,14 +175,12 @@ def blend_backward(
     With v = alpha dL/dalpha: v, v dx, v dy, v dx^2, v dx dy, v dy^2, then weight dL/dimage (3).
     """
     height, width = transmittance.shape
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     tiles = starts.shape[0] - 1
     for turn in portion(turns(tiles), share):
         tile = tile_at(turn, tiles)
         if tile >= tiles:
             continue
-        tile_y, tile_x = tile // tiles_x, tile % tiles_x
-        left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
+        left, top = corner(tile, width)
         x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
         s = np.zeros(SCRATCH, np.float32)
         splats = np.empty((ENTRIES_PER_CHECK, PARAMETERS), np.float32)
@@ -194,18 +209,9 @@ def blend_backward(
                 first_row, last_row = spans[j] >> 8, spans[j] & 255
                 m0 = mx = my = mxx = mxy = myy = m_red = m_green = m_blue = ZERO
                 for pixel in range(U(first_row) * WIDTH, U(last_row + 1) * WIDTH):
-                    dx = x - s[pixel + COLUMN]
-                    dy = y - s[pixel + ROW]
-                    p, r = l00 * dx + l10 * dy, l11 * dy
-                    uncapped = exp2_minus(p * p + (r * r - log2_opacity))
-                    alpha = min(cap, uncapped)
-                    alpha = alpha if alpha >= cutoff else ZERO
-                    t = s[pixel]
-                    weight = alpha * t
-                    t_next = t - weight
-                    open_ = t_next > stop
-                    weight = weight if open_ else ZERO
-                    s[pixel] = t_next if open_ else -abs(t)
+                    dx, dy = x - s[pixel + COLUMN], y - s[pixel + ROW]
+                    uncapped = falloff(dx, dy, l00, l10, l11, log2_opacity)
+                    alpha, weight, s[pixel], open_ = pass_through(s[pixel], uncapped, cutoff, cap, stop)
                     g0, g1, g2 = s[pixel + RED], s[pixel + GREEN], s[pixel + BLUE]
                     color_grad = g0 * red + g1 * green + g2 * blue
                     behind = s[pixel + BEHIND] - weight * color_grad
