@@ -7,7 +7,7 @@ import torch
 from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy import STREAMS, EntropyModel
 from compgs.entropy.gaussian import gaussian_bits, scale_from_index
-from compgs.entropy.models import make_entropy_model, starting_residuals
+from compgs.entropy.models import make_entropy_model
 from compgs.entropy.network import EntropyNetwork
 
 MODEL = ModelConfig(coupled_primitives=3, reference_dim=6, residuals=True, residual_dim=4)
@@ -161,7 +161,7 @@ def test_a_file_is_estimated_by_the_histograms_of_its_hyperpriors(entropy):
 
 
 def test_a_new_anchor_starts_with_the_residuals_that_the_prior_expects(entropy):
-    start = starting_residuals(entropy, MODEL)
+    start = entropy.starting_residuals()
     assert start.any()
     mean, _ = entropy.residual_network(torch.zeros(1, 9))
     if not entropy.residual_network.blocks:
