@@ -52,7 +52,7 @@ lint: venv
 	@$(BIN)/mypy
 
 docs: venv
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet && echo "the site is build/site/index.html"
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build && echo "the site is build/site/index.html"
 
 bounds:
 	@$(PYTHON) tools/check_bounds.py

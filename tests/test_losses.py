@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 import torch
 
-from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer, scale_unit
+from compgs.losses import (
+    Target,
+    photometric_loss,
+    rate,
+    rate_distortion_loss,
+    revival_loss,
+    scale_regularizer,
+    scale_unit,
+)
 from compgs.numerics import ssim as ssim_module
 from compgs.numerics.ssim import l1_and_ssim, window
 from compgs.tensors.ssim import ssim
@@ -153,6 +161,14 @@ def test_scales_are_measured_by_the_extent_of_the_scene_and_beyond_it_by_the_dis
     means = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 3.0], [1.0, 40.0, 0.0]])
     unit = scale_unit(means, torch.tensor([1.0, 0.0, 0.0]), 10.0)
     assert unit.flatten().tolist() == pytest.approx([2.0, 2.0, 8.0])
+
+
+def test_opacities_are_pulled_up_to_a_twentieth_and_no_further():
+    opacities = torch.tensor([-0.35, 0.0, 0.04, 0.06, 0.9], requires_grad=True)
+    loss = revival_loss(opacities)
+    loss.backward()
+    assert loss.item() == pytest.approx(0.1 * (0.4 + 0.05 + 0.01) / 5)
+    assert opacities.grad.tolist() == pytest.approx([-0.02, -0.02, -0.02, 0, 0])
 
 
 BITS = {

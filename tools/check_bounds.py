@@ -3,8 +3,8 @@
     python3 tools/check_bounds.py [--newest]
 
 Installs the project into a new environment with `NAME==LOWEST` for every dependency (or, with --newest, what pip takes
-today), runs tools/check_light.py there, and prints versions and size of what was installed. Needs Python 3.11, for
-which all of the lowest versions have wheels, and the network.
+today), runs tools/check_light.py there, and prints versions and size of what was installed. Needs the network, and a
+Python that the lowest versions have wheels for: 3.11.
 """
 
 import subprocess

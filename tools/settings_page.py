@@ -22,9 +22,11 @@ PAGE = ROOT / "docs" / "settings.md"
 
 INTRODUCTION = """# Settings
 
-Every setting of a training, as `src/compgs/config.py` declares it; this page is made from there by `tools/settings_page.py`. On the command line:
-`--set SECTION.NAME=VALUE`, as often as needed; `--lmbda`, `--steps`, `--seed` and `--target-size` are settings with options of their own. A column shows a
-preset's value where it differs from `default`. "Ref." marks values of the configuration that the paper's authors released; schedules are shares of the run.
+Every setting of a training, as `src/compgs/config.py` declares it; this page is made from there by
+`tools/settings_page.py`. On the command line: `--set SECTION.NAME=VALUE`, as often as needed; `--lmbda`, `--steps`,
+`--seed` and `--target-size` are settings with options of their own. A column shows a preset's value where it differs
+from `default`. "Ref." marks values of the configuration that the paper's authors released; schedules are shares of
+the run.
 """
 
 

@@ -69,6 +69,31 @@ def test_psnr_is_the_mean_over_views_of_a_closed_form(file: Path) -> None:
     assert results.psnr == pytest.approx(sum(psnrs) / 4, abs=1e-6)
 
 
+def test_seconds_are_the_median_and_lpips_is_of_all_views_or_of_none(file: Path) -> None:
+    results = evaluate(file, make_scene([101, 110, 50]), device="cpu")
+    views = [
+        replace(view, render_seconds=seconds, lpips=distance)
+        for view, seconds, distance in zip(results.per_view, (1.0, 9.0, 2.0), (0.1, 0.5, 0.3), strict=True)
+    ]
+    assert replace(results, per_view=tuple(views)).render_seconds == 2.0
+    assert replace(results, per_view=tuple(views)).lpips == pytest.approx(0.3)
+    views[1] = replace(views[1], lpips=None)
+    assert replace(results, per_view=tuple(views)).lpips is None
+
+
+def test_the_file_is_shown_on_the_background_of_the_scene(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = replace(make_scene([101]), background=(1.0, 0.5, 0.25))
+    asked = []
+    monkeypatch.setattr(
+        "compgs.evaluation.measure.open_scene",
+        lambda path, device, background: asked.append(background) or StandIn(0.5),
+    )
+    evaluate(file, scene, device="cpu")
+    assert set(asked) == {(1.0, 0.5, 0.25)}
+
+
 def test_ssim_is_the_mean_over_views(file: Path) -> None:
     scene = make_scene([101, 110, 50, 20])
     results = evaluate(file, scene, device="cpu")

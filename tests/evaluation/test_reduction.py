@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,6 +86,14 @@ def test_importance_sums_over_cameras_and_shares_the_pixels(data: bytes, cameras
     assert np.allclose(together, apart)
 
 
+def test_importance_is_the_same_wherever_the_scene_lies(data: bytes, cameras: list[Camera]) -> None:
+    """Cameras are the world's."""
+    model = decoded(data)
+    far = replace(model, world_offset=(1e5, -2e4, 0.0))
+    moved = [camera.moved((-1e5, 2e4, 0.0)) for camera in cameras]
+    np.testing.assert_allclose(importance(far, moved), importance(model, cameras), rtol=1e-3, atol=1e-2)
+
+
 @pytest.mark.parametrize("drop", [0.05, 0.5, 0.99])
 def test_the_least_important_share_goes(data: bytes, cameras: list[Camera], drop: float) -> None:
     model = decoded(data)
@@ -95,6 +104,13 @@ def test_the_least_important_share_goes(data: bytes, cameras: list[Camera], drop
     result, reduction = reduce_file(data, drop=drop, cameras=cameras)
     assert reduction.after.coupled_primitives == kept.sum() == decoded(result).coupled
     assert reduction.after.bytes == len(result) < reduction.before.bytes == len(data)
+
+
+def test_of_primitives_that_contribute_alike_the_later_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = np.array([1.0, 0.0, 0.0, 2.0, 0.0, 3.0])
+    monkeypatch.setattr("compgs.evaluation.reduction.importance", lambda *_: found)
+    model = SimpleNamespace(coupled=6)
+    assert most_important(model, [], 0.34).tolist() == [True, True, False, True, False, True]
 
 
 def test_dropping_what_contributes_least_loses_less_than_dropping_any(

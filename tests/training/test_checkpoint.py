@@ -6,7 +6,7 @@ import torch
 
 from compgs.errors import CheckpointError
 from compgs.interrupt import Terminated, ended_on_request, held_back
-from compgs.training.checkpoint import load_checkpoint
+from compgs.training.checkpoint import load_checkpoint, read_checkpoint_file, write_checkpoint_file
 from compgs.training.loop import Pace
 from compgs.training.trainer import Trainer
 
@@ -31,6 +31,20 @@ def test_a_run_stopped_anywhere_continues_exactly(blob_scene, tiny_config, tmp_p
         assert second.step == stop
         second.run(None, None)
         assert same(whole.model, second.model), f"stopped at step {stop}"
+
+
+def test_where_to_look_from_and_which_way_is_up_come_back(blob_scene, tiny_config, tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    model = Trainer(blob_scene, tiny_config, CPU).model
+    model.up = (0.0, 0.6, 0.8)
+    trainer = Trainer(blob_scene, tiny_config, CPU, model)
+    trainer.save(path)
+    again = load_checkpoint(path).model
+    assert again.up == (0.0, 0.6, 0.8)
+    assert len(again.viewpoints) == len(model.viewpoints) > 0
+    for mine, theirs in zip(model.viewpoints, again.viewpoints, strict=True):
+        assert (mine.world_to_camera == theirs.world_to_camera).all()
+        assert (mine.fx, mine.cy, mine.width) == (theirs.fx, theirs.cy, theirs.width)
 
 
 def test_an_interrupt_leaves_a_checkpoint_of_the_last_whole_step(blob_scene, tiny_config, tmp_path):
@@ -193,3 +207,13 @@ def test_the_pace_is_that_of_the_steps_without_compilation_and_checkpoints(monke
     assert pace.look() == pytest.approx(0.11)
     steps(10, 0.02)
     assert pace.look() == pytest.approx(0.02)
+
+
+def test_what_was_read_does_not_hold_the_file(tmp_path):
+    """A file that is mapped cannot be replaced on Windows; here its tensors would change with it."""
+    path = tmp_path / "checkpoint.safetensors"
+    write_checkpoint_file(path, "compgs", {"model/a": torch.arange(4096.0)}, {})
+    tensors, _ = read_checkpoint_file(path, "compgs")
+    with path.open("r+b") as file:
+        file.write(b"\0" * path.stat().st_size)
+    assert torch.equal(tensors["model/a"], torch.arange(4096.0))

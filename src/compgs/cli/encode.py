@@ -77,9 +77,9 @@ class Encode(DecodingCommand, ReadingOptions):
     def run(self) -> None:
         path = self.check()
         if self.source.is_dir():
-            self.prepare_training()
+            self.prepare_training("encode")
         else:
-            self.prepare()
+            self.prepare("decode")
         start = time.perf_counter()
         data = self.encoded_run() if self.source.is_dir() else read_bitstream(self.source)
         if self.reduces:

@@ -56,7 +56,7 @@ class View(ComputingCommand, SceneFileOrRunArgument):
 
         file, _ = file_and_run(self.file)
         check_scene(file)
-        self.prepare()
+        self.prepare("decode", "render")
         from compgs.devices import chosen_device
         from compgs.viewer.shown import FileShown
         from compgs.viewer.stage import OwnThread

@@ -18,9 +18,8 @@ variables (rather than in the buffer) spare the compiled code a check for overla
 """
 
 import numpy as np
-from numba import prange
 
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 from compgs.numerics.vector_sums import add_in_any_order
 from compgs.render.binning import (
     CHUNKS,
@@ -91,11 +90,13 @@ def pass_through(t, uncapped, cutoff, cap, stop):
 
 
 @njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
-def blend_forward(packed, starts, entries, order, background, cutoff, cap, stop, image, transmittance, ends):
+def blend_forward(
+    packed, starts, entries, order, background, cutoff, cap, stop, image, transmittance, ends, share
+):
     """Fills image [H, W, 3], transmittance [H, W] and, per tile, the entry after the last one needed."""
     height, width = transmittance.shape
     tiles = starts.shape[0] - 1
-    for turn in prange(turns(tiles)):
+    for turn in portion(turns(tiles), share):
         tile = tile_at(turn, tiles)
         if tile >= tiles:
             continue
@@ -167,6 +168,7 @@ def start_tile(s, left, top, width, height):
 def blend_backward(
     packed, starts, entries, order, ends, cutoff, cap, stop,
     image, transmittance, grad_image, grad_transmittance, moments,
+    share,
 ):  # fmt: skip
     """Fills moments [E, MOMENTS]: for each entry the sums over its pixels that gradients are made of.
 
@@ -174,7 +176,7 @@ def blend_backward(
     """
     height, width = transmittance.shape
     tiles = starts.shape[0] - 1
-    for turn in prange(turns(tiles)):
+    for turn in portion(turns(tiles), share):
         tile = tile_at(turn, tiles)
         if tile >= tiles:
             continue
@@ -247,13 +249,14 @@ def blend_backward(
 def sum_moments(
     visible, packed, first_slot, slots_used, slots, moments, opacities,
     grad_means, grad_covariances, grad_opacities, grad_colors,
+    share,
 ):  # fmt: skip
     """Adds up each splat's tiles, and turns moments into gradients.
 
     With X = cov^-1 and alpha = opacity exp(-d^T X d / 2): dL/dmean = -X sum(v d), dL/dcov = X sum(v d d^T) X
     / 2.
     """
-    for chunk in prange(CHUNKS):
+    for chunk in portion(CHUNKS, share):
         begin, end = chunk_bounds(chunk, visible.shape[0])
         for i in range(begin, end):
             if not visible[i]:

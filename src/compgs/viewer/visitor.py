@@ -159,7 +159,9 @@ class Visitor:
         result = render(model, camera, RasterSettings(background=look.background))
         image = to_8bit(result.image)
         seconds = self.clock() - start
-        pace.took(seconds)
+        share = pace.share
+        for each in (self.moving, self.resting):
+            each.took(seconds, share)
         return Picture(image, full, seconds, int(result.visible.sum()), model.counts)
 
     def image(self, camera: Camera) -> np.ndarray:
