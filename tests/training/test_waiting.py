@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from compgs.config import Config
-from compgs.render import RasterResult, visible_mask
+from compgs.render import RasterResult
+from compgs.tensors.visibility import visible_mask
 from compgs.training import loop as loop_module
 from compgs.training import trainer as trainer_module
 from compgs.training.optimizers import adam_rows
