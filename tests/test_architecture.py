@@ -29,6 +29,7 @@ ALLOWED = {
         "evaluation",
         "formats",
         "exporting",
+        "compressing",
     },
     "errors": set(),
     "interrupt": set(),
@@ -51,11 +52,13 @@ ALLOWED = {
     "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
     "reconstruct": BASE | {"scene"},
     "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
+    "compressing": BASE
+    | {"scene", "render", "model", "metrics", "formats", "codec", "evaluation", "training"},
     "viewer": BASE,
     "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},
     "cli": BASE
     | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "viewer", "reconstruct"},
+    | {"trained_model", "exporting", "compressing", "viewer", "reconstruct"},
     "__main__": BASE | {"cli"},
 }
 

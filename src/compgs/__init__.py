@@ -29,6 +29,7 @@ started = time.time()
 _HOME = {
     "load_scene": "compgs.scene",
     "train": "compgs.training",
+    "compress": "compgs.compressing",
     "encode": "compgs.codec",
     "decode": "compgs.codec",
     "render": "compgs.render",
@@ -46,6 +47,7 @@ __all__ = [
     "CompGSError",
     "Gaussians",
     "__version__",
+    "compress",
     "decode",
     "encode",
     "evaluate",
@@ -60,6 +62,7 @@ __all__ = [
 if TYPE_CHECKING:
     from compgs.cameras import Camera
     from compgs.codec import decode, encode
+    from compgs.compressing import compress
     from compgs.config import load_config
     from compgs.errors import CompGSError
     from compgs.evaluation import evaluate as evaluate

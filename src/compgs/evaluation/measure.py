@@ -36,6 +36,7 @@ def evaluate(
     lpips: bool = False,
     device: str | torch.device | None = None,
     progress: Callable[[int, int], None] | None = None,
+    truth: str = "photograph",
 ) -> Results:
     """Open a file of any known format (`compgs.formats`) and compare its renderings with a scene's held-out views.
 
@@ -43,7 +44,8 @@ def evaluate(
     does. With `output`, a folder, `results.json` and `per_view.json` (their schema: `compgs.evaluation.results`),
     `cameras.json` (of the held-out views), `test/renders`, `test/gt` and `contact_sheet.png` are written there.
     `progress(done, total)` is called after each view. Where the file tells that it was made from another scene, or from
-    views or sizes of images other than these, `notes` of the results say so.
+    views or sizes of images other than these, `notes` of the results say so. `truth`: what the views' images are, as
+    the contact sheet calls them.
 
     Raises BitstreamError, SplatFileError, SceneError if the scene holds no view out, OutputError.
     """
@@ -106,7 +108,7 @@ def evaluate(
         notes=misfits(model.viewpoints, scene),
     )
     if output is not None:
-        write_evaluation(Path(output), results, scene.test_views, images)
+        write_evaluation(Path(output), results, scene.test_views, images, truth)
     return results
 
 
@@ -123,7 +125,11 @@ def device_name(device: torch.device) -> str:
 
 
 def write_evaluation(
-    folder: Path, results: Results, views: tuple[View, ...], images: list[np.ndarray]
+    folder: Path,
+    results: Results,
+    views: tuple[View, ...],
+    images: list[np.ndarray],
+    truth: str = "photograph",
 ) -> None:
     """The files of an evaluation; images of an earlier one with more views are removed."""
     renders, photographs = folder / "test" / "renders", folder / "test" / "gt"
@@ -139,6 +145,7 @@ def write_evaluation(
     sheet = contact_sheet(
         [(views[i].image, images[i], views[i].name, results.per_view[i].psnr) for i in chosen],
         f"{results.scene}: {results.bytes / 1000:.1f} kB, {results.psnr:.2f} dB, {len(views)} held-out views",
+        truth,
     )
     write_bytes(folder / "contact_sheet.png", encode_png(sheet))
     write_json(folder / "cameras.json", [camera_entry(view.camera, view.name) for view in views])
