@@ -1,6 +1,8 @@
 # make demo   a scene is made, trained, encoded, and its file decoded and judged in a new process: about three minutes
 # make test   the test suite
 # make lint   style and types
+# make bounds the installation without extras, at the lowest versions that pyproject.toml allows, in a folder of its own
+# make docs   the documentation as a site, in build/site
 # make web    the page that shows scenes in a browser, from web/; needs node 20 or later, and npm
 # Needs python3 (3.11 or later) and make; everything else is installed into .venv in this folder.
 
@@ -14,20 +16,20 @@ export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 # Idle OpenMP threads sleep instead of taking the cores from numba's.
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: help demo test lint web venv
+.PHONY: help demo test lint bounds docs web venv
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
 
 venv: $(INSTALLED)
 
-$(INSTALLED): pyproject.toml
+$(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "Python 3.11 or later is needed, $$($(PYTHON) --version) was found; give another: make PYTHON=..."; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) \
 		|| { echo "python3 -m venv failed; on Debian and Ubuntu it is in the package python3-venv"; exit 1; }
 	@echo "installing CompGS and what it needs into $(VENV) (a few minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
 demo: venv
@@ -48,6 +50,12 @@ lint: venv
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@$(BIN)/mypy
+
+docs: venv
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build && echo "the site is build/site/index.html"
+
+bounds:
+	@$(PYTHON) tools/check_bounds.py
 
 web:
 	cd web && npm ci --ignore-scripts && npm run --silent build && npm run --silent declarations

@@ -163,7 +163,7 @@ def run_variant(
         "resumed": resumable,
         "seconds": time.time() - start,
         "settings": _json(folder / "config.json"),
-        "training": _json(folder / "training.json"),
+        "training": {k: v for k, v in (_json(folder / "training.json") or {}).items() if k != "curve"},
         "results": json.loads((folder / "results.json").read_text(encoding="utf-8")),
     }
     if variant.unrounded:

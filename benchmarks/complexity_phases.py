@@ -18,12 +18,13 @@ from typing import Any
 import codec
 from codec import timed
 
+from compgs import methods
 from compgs.cli.command import use_threads
 from compgs.cli.main import parse
-from compgs.cli.methods import METHODS
 from compgs.cli.run_folder import CHECKPOINT_NAME, RunSettings, file_name
 from compgs.cli.scenes import read_scene
 from compgs.cli.train import Train
+from compgs.methods import METHODS
 
 # Calls of which the median counts, after a first one that loads kernels and fills caches.
 REPEATS = 5
@@ -46,7 +47,7 @@ class Run:
 
     @property
     def file(self) -> Path:
-        return self.folder / file_name(self.folder, self.method.extension)
+        return self.folder / file_name(self.folder, self.method.suffix)
 
 
 # memory -------------------------------------------------------------------------------------------------------------
@@ -103,7 +104,8 @@ def train(run: Run) -> dict[str, Any]:
     scene = read_scene(run.settings.scene)
     config = run.settings.config
     memory = Memory()
-    seconds, _ = timed(lambda: run.method.train(scene, config, output=run.folder, device=run.device))
+    options = {"method": run.method.name, "output": run.folder, "device": run.device}
+    seconds, _ = timed(lambda: methods.train(scene, config, **options))
     steps = config.training.steps
     return {"steps": steps, "seconds": seconds, "seconds_per_step": seconds / steps, **memory.measured()}
 
@@ -112,7 +114,7 @@ def encode(run: Run) -> dict[str, Any]:
     """From a trained model to its file on disk."""
     model = trained(run)
     memory = Memory()
-    return {**repeated(lambda: run.method.write(model, run.file)), **memory.measured()}
+    return {**repeated(lambda: run.method.write(model, run.file, run.settings.config)), **memory.measured()}
 
 
 def trained(run: Run) -> Any:
@@ -121,12 +123,13 @@ def trained(run: Run) -> Any:
         from compgs.training import load_run
 
         return load_run(run.folder)
-    from compgs.model.splats import SplatModel, Splats
+    from compgs.model.splats import SplatModel
+    from compgs.tensors.splats import Splats
     from compgs.training.checkpoint import read_checkpoint_file, tensors_by_kind
     from compgs.training.splat_trainer import METHOD
 
     tensors, _ = read_checkpoint_file(run.folder / CHECKPOINT_NAME, METHOD)
-    return SplatModel(Splats(**tensors_by_kind(tensors)["model"]), BLACK)
+    return SplatModel(Splats(**tensors_by_kind(tensors)["model"]).arrays(), BLACK)
 
 
 def decode(run: Run) -> dict[str, Any]:

@@ -19,7 +19,8 @@ from compgs.codec.reader import read_latents
 from compgs.codec.writer import write_content
 from compgs.gaussians import Gaussians
 from compgs.model import HybridModel
-from compgs.model.prediction import predict_by_torch, see
+from compgs.tensors.prediction import predict_by_torch, see
+from compgs.tensors.scenes import HybridOnDevice
 
 sys.path.append(str(Path(__file__).parent.parent / "tools"))
 from made_content import make_content, make_dimensions, paper_groups
@@ -49,15 +50,16 @@ def camera_at(center: tuple[float, float, float]) -> Camera:
 
 
 def arrays(gaussians: Gaussians) -> Arrays:
-    return {name: getattr(gaussians, field).double().numpy() for name, field in FIELDS.items()}
+    return {name: np.asarray(getattr(gaussians, field), np.float64) for name, field in FIELDS.items()}
 
 
 def by_torch(model: HybridModel, camera: Camera) -> Gaussians:
     """The readable prediction in float32; its networks run in kernels."""
-    p, center = model.primitives, torch.tensor(camera.center, dtype=torch.float32)
+    scene = HybridOnDevice.of(model, torch.device("cpu"))
+    p, center = scene.primitive_tensors, torch.tensor(camera.center, dtype=torch.float32)
     seen = see(p.references, p.positions, center, model.distance_unit)
     with torch.no_grad():
-        return predict_by_torch(model.heads, p, seen).gaussians
+        return predict_by_torch(scene.networks, p, seen).gaussians
 
 
 def deviations(found: Arrays, truth: Arrays) -> dict[str, float]:
@@ -89,7 +91,7 @@ def cases() -> Iterator[tuple[str, HybridModel, Content]]:
         made = make_content(120, 1, d, kept=0.7)
         made = replace(made, heads=make_heads(np.random.default_rng(2), d))
         content, latents = read_latents(write_content(made))
-        model = from_latents(content, latents, torch.device("cpu"))
+        model = from_latents(content, latents)
         yield f"{d.heads}, width {d.width}", model, plain_content(content, latents)
 
 

@@ -34,9 +34,9 @@ import torch  # noqa: E402
 
 from compgs.cameras import Camera  # noqa: E402
 from compgs.render.binning import bin_splats  # noqa: E402
-from compgs.render.numba_backend import Blend  # noqa: E402
-from compgs.render.projection import Project, camera_numbers  # noqa: E402
+from compgs.render.projection import camera_numbers  # noqa: E402
 from compgs.render.settings import DEFAULT_SETTINGS  # noqa: E402
+from compgs.tensors.numba_backend import Blend, Project  # noqa: E402
 
 # Counted in tiles.py: one pixel of one splat, an fma as two, comparisons and selections as none.
 FORWARD_FLOPS = 2 + 7 + 13 + 2 + 6  # offset, exponent, exp2, transmittance, color

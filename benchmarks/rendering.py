@@ -31,12 +31,12 @@ KEPT = 0.8  # share of coupled primitives that exist
 # Where a frame's time goes: part, module and function.
 PARTS = (
     ("culling", "compgs.render.render_model", "visible_mask"),
-    ("networks", "compgs.model.hybrid_model", "predict_appearance"),
-    ("gathering what is drawn", "compgs.model.hybrid_model", "gather_drawn"),
-    ("projection", "compgs.render.numba_backend", "project_forward"),
-    ("binning: tiles of each splat", "compgs.render.numba_backend", "pack_splats"),
-    ("binning: lists of each tile", "compgs.render.numba_backend", "list_tiles"),
-    ("blending", "compgs.render.numba_backend", "blend"),
+    ("networks", "compgs.model.prediction_kernels", "paired_appearance"),
+    ("gathering what is drawn", "compgs.model.prediction_kernels", "gather_drawn"),
+    ("projection", "compgs.render.rasterize", "project_forward"),
+    ("binning: tiles of each splat", "compgs.render.rasterize", "pack_splats"),
+    ("binning: lists of each tile", "compgs.render.rasterize", "list_tiles"),
+    ("blending", "compgs.render.rasterize", "blend"),
 )
 
 
@@ -134,12 +134,10 @@ def decode(options: argparse.Namespace) -> dict[str, Any]:
 
 def render(options: argparse.Namespace) -> dict[str, Any]:
     import numba
-    import torch
 
     from compgs.codec.decoder import decode
     from compgs.render import RasterSettings, render, visible_mask
 
-    torch.set_num_threads(options.threads)
     numba.set_num_threads(options.threads)
     views = cameras(options)
     render(decode(options.tiny), views[0])
@@ -163,7 +161,7 @@ def render(options: argparse.Namespace) -> dict[str, Any]:
     shares, drawn = [], []
     for view in views:
         visible = visible_mask(*model.bounds, view, RasterSettings())
-        shares.append(float(visible.float().mean()))
+        shares.append(float(visible.mean()))
         drawn.append(len(model.gaussians(view, visible)))
     geometry_mb = megabytes(*model.geometry, *model.bounds[1:])
     return {
@@ -196,12 +194,13 @@ def precision(options: argparse.Namespace) -> dict[str, Any]:
     from compgs.metrics import psnr, to_8bit
     from compgs.render import render
     from compgs.scene import load_scene
+    from compgs.tensors.scenes import HybridOnDevice
 
     views = load_scene(options.scene, downscale=options.downscale).test_views
     model = decode(options.file)
     found = {}
     for dtype in (torch.float32, torch.bfloat16, torch.float16):
-        rough = replace(model, appearance_dtype=dtype)
+        rough = replace(HybridOnDevice.of(model, torch.device("cpu")), appearance_dtype=dtype)
         values = [psnr(to_8bit(render(rough, v.camera).image), v.image) for v in views]
         found[str(dtype).removeprefix("torch.")] = sum(values) / len(values)
     return found

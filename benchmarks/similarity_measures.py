@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from compgs.model.splats import Splats
-from compgs.render.reference import rotation_matrices
+from compgs.model.splats import SplatArrays
+from compgs.tensors.reference import rotation_matrices
+from compgs.tensors.splats import Splats
 
 Array = NDArray[np.float32]
 Index = NDArray[np.int64]
@@ -43,10 +44,11 @@ class Similarity:
 # attributes ---------------------------------------------------------------------------------------------------------
 
 
-def attributes(splats: Splats) -> dict[str, Array]:
+def attributes(arrays: SplatArrays) -> dict[str, Array]:
     """[M, C] each, nothing of them a position. What is arbitrary in a splat is not in them: the order of its axes
     and the sign of its quaternion.
     """
+    splats = Splats.of(arrays)
     result = {
         "scales": splats.log_scales.sort(dim=1, descending=True).values,
         "orientation": stretch(splats.log_scales, splats.quaternions),
@@ -71,16 +73,16 @@ def stretch(log_scales: torch.Tensor, quaternions: torch.Tensor) -> torch.Tensor
     return matrices[:, rows, columns] * twice
 
 
-def as_stored(splats: Splats) -> Array:
+def as_stored(splats: SplatArrays) -> Array:
     """[M, C]: every number of the .ply file but position and normal, not centred, not scaled."""
     parts = [
         splats.dc,
-        splats.rest.flatten(1),
+        splats.rest.reshape(len(splats), -1),
         splats.opacity_logits[:, None],
         splats.log_scales,
         splats.quaternions,
     ]
-    return torch.cat(parts, 1).numpy()
+    return np.concatenate(parts, 1)
 
 
 def normalized(values: Array) -> Array:
@@ -164,9 +166,9 @@ class Measured:
         }
 
 
-def measure(splats: Splats) -> Measured:
+def measure(splats: SplatArrays) -> Measured:
     """Raises SystemExit for fewer splats than neighbours."""
-    near = nearest(splats.means.numpy(), NEIGHBOURS)
+    near = nearest(splats.means, NEIGHBOURS)
     far = random_others(len(splats), NEIGHBOURS)
     parts = {name: normalized(values) for name, values in attributes(splats).items()}
     together = np.concatenate(list(parts.values()), axis=1)

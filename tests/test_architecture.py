@@ -14,11 +14,12 @@ SOURCE = Path(compgs.__file__).parent
 
 # A part may import itself, and the parts named here.
 BASE = {
-    "compgs", "numerics", "errors", "gaussians", "cameras", "config", "interrupt", "outputs", "presets",
+    "compgs", "numerics", "errors", "extras", "gaussians", "cameras", "config", "interrupt", "outputs", "presets",
 }  # fmt: skip
 ALLOWED = {
     "compgs": {
         "errors",
+        "extras",
         "gaussians",
         "cameras",
         "config",
@@ -30,35 +31,56 @@ ALLOWED = {
         "formats",
         "exporting",
         "compressing",
+        "methods",
     },
     "errors": set(),
+    "extras": {"errors"},
+    "devices": {"errors", "extras", "tensors"},
     "interrupt": set(),
     "outputs": {"errors"},
     "gaussians": set(),
     "cameras": set(),
     "config": {"errors", "presets"},
     "presets": set(),
-    "numerics": {"compgs"},  # for `compgs.started`
+    "numerics": {"compgs", "extras"},  # `compgs.started`
     "scene": BASE,
     "render": BASE,
     "model": BASE,
-    "entropy": BASE,
-    "losses": BASE,
+    "tensors": BASE | {"model", "render"},
+    "entropy": BASE | {"tensors"},
+    "losses": BASE | {"tensors"},
     "metrics": BASE,
     "stored_weights": BASE | {"model", "entropy"},
-    "trained_model": BASE | {"model", "entropy", "stored_weights"},
-    "codec": BASE | {"model", "entropy", "trained_model"},
-    "formats": BASE | {"model", "render", "codec"},
-    "training": BASE | {"scene", "render", "model", "entropy", "losses", "metrics", "trained_model"},
+    "trained_model": BASE | {"model", "entropy", "tensors", "devices", "stored_weights"},
+    "codec": BASE | {"model", "devices", "entropy", "trained_model"},
+    "formats": BASE
+    | {"model", "render", "devices", "codec", "methods"},  # up for a method's own files, which name it
+    "training": BASE
+    | {"scene", "render", "model", "tensors", "devices", "entropy", "losses", "metrics", "trained_model"},
+    "methods": BASE
+    | {"scene", "model", "entropy", "render", "tensors", "devices", "losses", "metrics", "codec", "formats"}
+    | {"training", "trained_model", "stored_weights"},
     "reconstruct": BASE | {"scene"},
-    "evaluation": BASE | {"scene", "render", "model", "entropy", "metrics", "codec", "formats"},
+    "evaluation": BASE | {"scene", "render", "model", "devices", "metrics", "codec", "formats"},
+    "viewer": BASE | {"render", "model", "devices", "metrics", "codec", "formats", "evaluation"},
+    "exporting": BASE | {"render", "model", "devices", "metrics", "formats", "evaluation", "viewer"},
     "compressing": BASE
-    | {"scene", "render", "model", "metrics", "formats", "codec", "evaluation", "training"},
-    "viewer": BASE,
-    "exporting": BASE | {"render", "model", "metrics", "formats", "evaluation", "viewer"},
+    | {
+        "scene",
+        "render",
+        "model",
+        "devices",
+        "metrics",
+        "formats",
+        "codec",
+        "evaluation",
+        "training",
+        "methods",
+    },
+    "suites": BASE | {"evaluation", "methods", "metrics"},
     "cli": BASE
-    | {"scene", "render", "model", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "compressing", "viewer", "reconstruct"},
+    | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "training", "evaluation"}
+    | {"trained_model", "exporting", "compressing", "viewer", "methods", "reconstruct", "suites"},
     "__main__": BASE | {"cli"},
 }
 
@@ -92,6 +114,55 @@ def test_imports_point_one_way(file: Path) -> None:
     assert imported_parts(file) <= ALLOWED[part] | {part}
 
 
+# What trains, and what it alone needs. Everything else computes with numpy and numba.
+HEAVY = {"torch", "scipy", "safetensors"}
+TRAINS = {"tensors", "entropy", "losses", "stored_weights", "trained_model", "training", "codec.encoder"}
+# Where one of HEAVY is loaded beside that, inside a function, for what cannot be done without it.
+LOADS = {
+    "cli.command": "threads of a training",
+    "devices": "CUDA",
+    "evaluation.bd_rate": "interpolation",
+    "metrics": "LPIPS",
+    "numerics.nearest": "a k-d tree",
+}
+
+
+def loads_heavy(file: Path, *, at_import: bool) -> bool:
+    """Whether a source file imports one of HEAVY: anywhere in it, or as soon as it is itself imported."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    typing_only = {
+        id(node)
+        for guard in ast.walk(tree)
+        if isinstance(guard, ast.If) and isinstance(guard.test, ast.Name) and guard.test.id == "TYPE_CHECKING"
+        for node in ast.walk(guard)
+    }
+    for node in tree.body if at_import else ast.walk(tree):
+        modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        modules += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        if id(node) not in typing_only and {module.split(".")[0] for module in modules} & HEAVY:
+            return True
+    return False
+
+
+def test_torch_scipy_and_safetensors_are_imported_where_training_is_and_nowhere_else() -> None:
+    for file in SOURCE.rglob("*.py"):
+        names = file.relative_to(SOURCE).with_suffix("").parts
+        name = ".".join(names)
+        if names[0] in TRAINS or name in TRAINS:
+            continue
+        assert not loads_heavy(file, at_import=True), name
+        assert loads_heavy(file, at_import=False) == (name in LOADS), name
+
+
+def test_what_only_looks_at_scenes_never_reaches_the_rooms_that_train() -> None:
+    """But through `devices` (CUDA), `codec` (the encoder stands beside the decoder), `methods` (train and open)
+    and `compressing` (trains on splats)."""
+    rooms = {name for name in TRAINS if "." not in name}
+    assert {name for name in ALLOWED if ALLOWED[name] & rooms and name not in rooms} == {
+        "compgs", "devices", "codec", "methods", "compressing", "cli",
+    }  # fmt: skip
+
+
 def test_only_the_command_line_prints() -> None:
     printing = [
         str(file.relative_to(SOURCE))
@@ -123,6 +194,12 @@ def test_formats_are_read_and_written_without_torch() -> None:
     loaded = modules_after("import compgs.formats")
     assert "compgs.formats.sog" in loaded
     assert not loaded & {"torch", "numba", "scipy"}
+
+
+def test_methods_are_named_without_what_trains_them() -> None:
+    loaded = modules_after("import compgs.methods; compgs.methods.settings_of('3dgs')")
+    assert "compgs.methods.splats" in loaded
+    assert not loaded & {"torch", "numba", "scipy", "compgs.training"}
 
 
 def test_the_command_line_starts_without_torch() -> None:
@@ -160,20 +237,14 @@ def test_from_bytes_to_symbols_no_torch_is_loaded(module: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "module",
-    [
-        "constants",
-        "arrays",
-        "residual_mlp_kernels",
-        "prediction_kernels",
-        "spherical_harmonics_kernels",
-        "inference",
-    ],
+    "package", ["model", "render", "formats", "evaluation", "exporting", "viewer", "metrics"]
 )
-def test_from_arrays_to_gaussians_no_torch_is_loaded(module: str) -> None:
-    loaded = modules_after(f"import compgs.model.{module}")
-    assert f"compgs.model.{module}" in loaded
-    assert "torch" not in loaded
+def test_looking_at_scenes_loads_no_torch(package: str) -> None:
+    folder = SOURCE / package
+    modules = [f"compgs.{package}", *(f"compgs.{package}.{file.stem}" for file in folder.glob("[a-z]*.py"))]
+    loaded = modules_after("; ".join(f"import {module}" for module in modules))
+    assert set(modules) <= loaded
+    assert not loaded & (HEAVY - {"scipy"})  # numba asks for scipy's version wherever it is installed
 
 
 def test_public_names_exist() -> None:

@@ -1,33 +1,34 @@
 """Export from a file to a file: what is written, what is measured, what is refused."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 import compgs
 from compgs import exporting
 from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import surround
 from compgs.exporting import Exported, export, own_cameras, smaller
-from compgs.formats import arrays_of, encoded, open_scene, read_ply
+from compgs.formats import encoded, open_scene, read_ply
+from compgs.formats.arrays import normalized
 from compgs.formats.ply import ply_size
-from compgs.model.splats import SplatModel, Splats
+from compgs.model.splats import SplatArrays, SplatModel
 
 
-def splats(count: int = 60, degree: int = 1) -> Splats:
-    chance = torch.Generator().manual_seed(0)
-    return Splats(
-        means=torch.rand(count, 3, generator=chance),
-        log_scales=torch.full((count, 3), -2.5),
-        quaternions=torch.randn(count, 4, generator=chance),
-        opacity_logits=torch.linspace(-3, 3, count),
-        dc=torch.randn(count, 3, generator=chance),
-        rest=0.2 * torch.randn(count, (degree + 1) ** 2 - 1, 3, generator=chance),
-    )
+def splats(count: int = 60, degree: int = 1) -> SplatArrays:
+    chance = np.random.default_rng(0)
+    return SplatArrays(
+        means=chance.random((count, 3)),
+        log_scales=np.full((count, 3), -2.5),
+        quaternions=chance.normal(size=(count, 4)),
+        opacity_logits=np.linspace(-3, 3, count),
+        dc=chance.normal(size=(count, 3)),
+        rest=0.2 * chance.normal(size=(count, (degree + 1) ** 2 - 1, 3)),
+    ).each(np.float32)
 
 
 @pytest.fixture(autouse=True)
@@ -39,7 +40,7 @@ def fewer_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def ply(tmp_path: Path) -> Path:
     path = tmp_path / "a.ply"
-    path.write_bytes(encoded(arrays_of(splats()), "ply"))
+    path.write_bytes(encoded(splats(), "ply"))
     return path
 
 
@@ -55,11 +56,11 @@ def test_splats_that_nothing_is_asked_of_keep_their_numbers(ply: Path, tmp_path:
     assert done.worst > 90 and len(done.psnr) == 20
     again = open_scene(out)
     assert isinstance(again, SplatModel)
-    for name, tensor in vars(splats()).items():
+    for name, array in vars(splats()).items():
         found = getattr(again.splats, name)
         if name == "quaternions":
-            tensor, found = (torch.nn.functional.normalize(t, dim=1) for t in (tensor, found))
-        torch.testing.assert_close(found, tensor, atol=1e-5, rtol=0)
+            array, found = normalized(array), normalized(found)
+        np.testing.assert_allclose(found, array, atol=1e-5, rtol=0)
 
 
 def test_the_loss_of_quantization_is_measured_on_the_written_file(ply: Path, tmp_path: Path) -> None:
@@ -79,7 +80,7 @@ def test_a_limit_on_splats_keeps_those_that_count(ply: Path, tmp_path: Path) -> 
     kept = read_ply(tmp_path / "b.ply")
     assert len(kept) == done.splats == 20 and done.dropped == 40
     # All are of one size and in one place: the opaque ones count.
-    assert kept.opacity_logits.mean() > splats().opacity_logits.median()
+    assert kept.opacity_logits.mean() > np.median(splats().opacity_logits)
 
 
 @pytest.mark.parametrize("kind", ["ply", "spz"])
@@ -110,7 +111,7 @@ def test_degrees_are_lowered_before_splats_are_left_out(
     tmp_path: Path, limit: int | None, degree: int, kept: int
 ) -> None:
     source = tmp_path / "a.ply"
-    source.write_bytes(encoded(arrays_of(splats(degree=3)), "ply"))
+    source.write_bytes(encoded(splats(degree=3), "ply"))
     done = export(source, tmp_path / "b.ply", max_bytes=limit, refine=0)
     assert done.degree == degree and done.splats is not None and abs(done.splats - kept) <= 1
     assert limit is None or done.bytes <= limit
@@ -163,15 +164,15 @@ def test_what_cannot_be_written_is_refused_before_anything_is_read(tmp_path: Pat
 def test_places_in_the_world_are_kept_where_the_format_can(tmp_path: Path) -> None:
     source = tmp_path / "a.glb"
     offset = (4.2e6, 5e5, -20.0)
-    source.write_bytes(encoded(arrays_of(splats(), offset), "glb"))
+    source.write_bytes(encoded(replace(splats(), world_offset=offset), "glb"))
     assert export(source, tmp_path / "b.glb").origin == (0.0, 0.0, 0.0)
     assert open_scene(tmp_path / "b.glb").world_offset == offset
     for kind in ("spz", "sog"):
         done = export(source, tmp_path / f"b.{kind}")
         assert done.origin == offset and done.worst > 25
     export(source, tmp_path / "b.ply")
-    expected = splats().means.double() + torch.tensor(offset, dtype=torch.float64)
-    assert torch.equal(read_ply(tmp_path / "b.ply").means, expected.float())
+    expected = splats().means + np.array(offset)
+    assert np.array_equal(read_ply(tmp_path / "b.ply").means, expected.astype(np.float32))
 
 
 def test_progress_ends_at_its_total(ply: Path, tmp_path: Path) -> None:
@@ -182,9 +183,9 @@ def test_progress_ends_at_its_total(ply: Path, tmp_path: Path) -> None:
 
 
 def test_without_viewpoints_a_scene_is_looked_at_from_all_around() -> None:
-    model = SplatModel(splats(), (0.0, 0.0, 0.0), (1e6, 0.0, 0.0))
+    model = SplatModel(replace(splats(), world_offset=(1e6, 0.0, 0.0)), (0.0, 0.0, 0.0))
     cameras = own_cameras(model)
-    middle = splats().means.median(0).values.numpy() + np.array(model.world_offset)
+    middle = np.median(splats().means, 0) + np.array(model.world_offset)
     directions = np.stack([camera.center - middle for camera in cameras])
     assert len(cameras) == 8 and np.abs(directions).max() < 10
     assert np.abs(directions.mean(0)[[0, 2]]).max() < 0.2 * np.linalg.norm(directions, axis=1).mean()

@@ -5,9 +5,18 @@ import numpy as np
 import pytest
 import torch
 
-from compgs.losses import Target, photometric_loss, rate, rate_distortion_loss, scale_regularizer, scale_unit
+from compgs.losses import (
+    Target,
+    photometric_loss,
+    rate,
+    rate_distortion_loss,
+    revival_loss,
+    scale_regularizer,
+    scale_unit,
+)
 from compgs.numerics import ssim as ssim_module
-from compgs.numerics.ssim import l1_and_ssim, ssim, window
+from compgs.numerics.ssim import l1_and_ssim, window
+from compgs.tensors.ssim import ssim
 
 
 def pair(height, width, seed=0):
@@ -100,6 +109,7 @@ def test_a_perfect_rendering_costs_nothing_and_has_no_gradient():
     assert x.grad.abs().max() <= 0.81 / x.numel()
 
 
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
 def test_gradients_are_the_same_bits_with_one_thread_and_with_several():
     rendering, photograph = pair(64, 90)
     threads = numba.get_num_threads()
@@ -153,6 +163,14 @@ def test_scales_are_measured_by_the_extent_of_the_scene_and_beyond_it_by_the_dis
     assert unit.flatten().tolist() == pytest.approx([2.0, 2.0, 8.0])
 
 
+def test_opacities_are_pulled_up_to_a_twentieth_and_no_further():
+    opacities = torch.tensor([-0.35, 0.0, 0.04, 0.06, 0.9], requires_grad=True)
+    loss = revival_loss(opacities)
+    loss.backward()
+    assert loss.item() == pytest.approx(0.1 * (0.4 + 0.05 + 0.01) / 5)
+    assert opacities.grad.tolist() == pytest.approx([-0.02, -0.02, -0.02, 0, 0])
+
+
 BITS = {
     "reference_hyper": torch.tensor([4.0, 8.0]),
     "reference": torch.tensor([32.0, 64.0]),
@@ -200,3 +218,90 @@ def test_cuda_agrees_with_the_cpu():
         results.append((loss.item(), x.grad.cpu()))
     assert results[0][0] == pytest.approx(results[1][0], abs=1e-5)
     assert (results[0][1] - results[1][1]).abs().max() <= 1e-3 * results[0][1].abs().max()
+
+
+# masks
+
+
+def masked_pair(height, width, seed=0):
+    rendering, photograph = pair(height, width, seed)
+    counted = np.random.default_rng(seed + 1).random((height, width)) < 0.6
+    counted[: height // 2, : width // 3] = False
+    counted[-1, -1] = True
+    return rendering, photograph, counted
+
+
+def masked_ssim_by_definition(x, y, counted):
+    """Mean SSIM of the pixels that count, window by window; the others are black, as outside of the image."""
+    taps = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    weights = np.outer(taps, taps) / taps.sum() ** 2
+    x, y = (np.pad(a * counted[..., None], ((5, 5), (5, 5), (0, 0))) for a in (x, y))
+    values = []
+    for i, j in np.argwhere(counted):
+        for c in range(3):
+            p, q = x[i : i + 11, j : j + 11, c], y[i : i + 11, j : j + 11, c]
+            m, n = (weights * p).sum(), (weights * q).sum()
+            v, w = (weights * p * p).sum() - m * m, (weights * q * q).sum() - n * n
+            value = (2 * m * n + 1e-4) * (2 * ((weights * p * q).sum() - m * n) + 9e-4)
+            values.append(value / ((m * m + n * n + 1e-4) * (v + w + 9e-4)))
+    return np.mean(values)
+
+
+def test_masked_l1_and_ssim_agree_with_their_definition():
+    x, y, counted = masked_pair(19, 23)
+    photograph = y.double() / 255
+    expected = masked_ssim_by_definition(x.numpy(), photograph.numpy(), counted)
+    assert float(ssim(x, photograph, torch.from_numpy(counted))) == pytest.approx(expected, abs=1e-12)
+    l1, similarity, _ = l1_and_ssim(x.float().numpy(), y.numpy(), counted=counted)
+    assert similarity == pytest.approx(expected, abs=2e-6)
+    assert l1 == pytest.approx(float((x - photograph).abs().numpy()[counted].mean()), rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [(33, 47), (5, 4), (21, 160), (18, 375)], ids=str)
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_masked_loss_and_gradient_agree_with_float64_autograd(size, weight):
+    rendering, photograph, counted = masked_pair(*size)
+    target = Target.from_image(photograph.numpy(), mask=counted)
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        x = rendering.to(dtype).requires_grad_()
+        loss = photometric_loss(x, target, weight)
+        (2.5 * loss).backward()
+        results.append((loss.item(), x.grad.double()))
+    (fused, fused_gradient), (plain, plain_gradient) = results
+    assert fused == pytest.approx(plain, abs=3e-6)
+    assert (fused_gradient - plain_gradient).abs().max() <= 1e-5 * plain_gradient.abs().max()
+    assert not fused_gradient[torch.from_numpy(~counted)].any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_is_masked_does_not_matter_in_either_image(dtype):
+    rendering, photograph, counted = masked_pair(30, 40)
+    other_rendering, other_photograph = rendering.clone(), photograph.clone()
+    other_rendering[torch.from_numpy(~counted)] = 0.7
+    other_photograph[torch.from_numpy(~counted)] = 255
+    losses = [
+        float(photometric_loss(x.to(dtype), Target.from_image(y.numpy(), mask=counted)))
+        for x in (rendering, other_rendering)
+        for y in (photograph, other_photograph)
+    ]
+    assert len(set(losses)) == 1
+
+
+def test_a_mask_of_which_all_counts_changes_nothing():
+    rendering, photograph = pair(30, 40)
+    every = np.ones((30, 40), dtype=bool)
+    x = rendering.float()
+    assert torch.equal(
+        photometric_loss(x, Target.from_image(photograph.numpy(), mask=every)),
+        photometric_loss(x, photograph),
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_view_of_which_nothing_counts_teaches_nothing(dtype):
+    rendering, photograph = pair(30, 40)
+    x = rendering.to(dtype).requires_grad_()
+    loss = photometric_loss(x, Target.from_image(photograph.numpy(), mask=np.zeros((30, 40), dtype=bool)))
+    loss.backward()
+    assert loss.item() == 0.0 and not x.grad.any()

@@ -8,7 +8,7 @@ from torch import nn
 
 from compgs import metrics
 from compgs.errors import CompGSError
-from compgs.numerics.ssim import ssim
+from compgs.tensors.ssim import ssim
 
 RNG = np.random.default_rng(0)
 PHOTOGRAPH = RNG.integers(0, 256, (40, 50, 3), dtype=np.uint8)
@@ -33,6 +33,13 @@ def test_identical_images_have_infinite_psnr_and_an_ssim_of_one():
     assert metrics.ssim(PHOTOGRAPH, PHOTOGRAPH.copy()) == pytest.approx(1.0, abs=1e-6)
 
 
+def test_of_pictures_that_may_be_equal_the_mean_is_finite_unless_all_are():
+    assert metrics.mean_psnr([30.0, 40.0]) == 35.0
+    assert metrics.mean_psnr([math.inf, 40.0]) == 70.0
+    assert metrics.mean_psnr([120.0, 40.0]) == 70.0
+    assert metrics.mean_psnr([math.inf, math.inf]) == math.inf
+
+
 @pytest.mark.parametrize("metric", [metrics.psnr, metrics.ssim])
 def test_metrics_are_symmetric_and_fall_with_the_disturbance(metric):
     values = [metric(PHOTOGRAPH, disturbed(amount)) for amount in (2, 20, 100)]
@@ -50,7 +57,7 @@ def test_ssim_agrees_with_float64():
 
 
 def test_renderings_are_rounded_and_clamped_not_truncated():
-    image = torch.tensor([[[0.9 / 255, 0.4 / 255, 254.6 / 255], [-0.3, 1.7, 1.0]]])
+    image = np.array([[[0.9 / 255, 0.4 / 255, 254.6 / 255], [-0.3, 1.7, 1.0]]], np.float32)
     assert metrics.to_8bit(image).tolist() == [[[1, 0, 255], [0, 255, 255]]]
 
 
@@ -111,3 +118,36 @@ def test_lpips_without_weights_says_which_file_is_missing_and_downloads_nothing(
     with pytest.raises(metrics.Unavailable, match=r"alexnet.*missing"):
         metrics.lpips(PHOTOGRAPH, PHOTOGRAPH, "alex")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_masked_metrics_are_those_of_the_pixels_that_count():
+    rng = np.random.default_rng(0)
+    a, b = (rng.integers(0, 256, (30, 40, 3), dtype=np.uint8) for _ in range(2))
+    mask = np.zeros((30, 40), dtype=bool)
+    mask[:, :25] = True
+    a[~mask], b[~mask] = 0, 255
+    assert metrics.psnr(a, b, mask) == metrics.psnr(a[:, :25], b[:, :25])
+    # What is masked is as what lies outside of an image.
+    assert metrics.ssim(a, b, mask) == pytest.approx(metrics.ssim(a[:, :25], b[:, :25]), abs=1e-6)
+
+
+def test_lpips_sees_black_where_pixels_do_not_count_and_is_of_the_share_that_does():
+    seen = []
+
+    def network(x, y):
+        seen.append((x, y))
+        return (x - y).abs().mean()
+
+    a, b = np.full((8, 10, 3), 100, np.uint8), np.full((8, 10, 3), 151, np.uint8)
+    mask = np.zeros((8, 10), dtype=bool)
+    mask[:4] = True
+    assert metrics.lpips(a, b, network, mask) == pytest.approx(metrics.lpips(a, b, network))
+    for image in seen[0]:
+        assert (image[0, :, 4:] == -1).all() and (image[0, :, :4] != -1).all()
+
+
+@pytest.mark.parametrize("mask", [np.zeros((8, 10), bool), np.ones((10, 8), bool), np.ones((8, 10))])
+def test_masks_that_fit_no_image_are_refused(mask):
+    image = np.zeros((8, 10, 3), np.uint8)
+    with pytest.raises(ValueError, match="mask"):
+        metrics.psnr(image, image, mask)

@@ -13,7 +13,7 @@ import torch
 from compgs.cli.main import main
 from compgs.cli.usage import in_words_of_options
 from compgs.errors import OutputError
-from compgs.outputs import check_output_file, check_output_folder, write_bytes, write_json
+from compgs.outputs import check_output_file, check_output_folder, filling, write_bytes, write_json
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -165,3 +165,50 @@ def test_python_is_told_which_argument_to_give_and_a_terminal_which_option(
     assert in_words_of_options("training.target_bytes = 1: too few") == "--target-size 1: too few"
     assert main(["demo-scene", str(tmp_path)]) == 1
     assert capsys.readouterr().err.endswith("choose another folder or give --overwrite\n")
+
+
+def test_a_folder_is_filled_when_everything_is_there_and_not_before(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "folder"
+    with filling(folder) as place:
+        write_bytes(place / "a" / "00000.png", b"1")
+        write_bytes(place / "b.json", b"2")
+        assert not folder.exists()
+    found = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert found == {"a/00000.png": b"1", "b.json": b"2"}
+    assert [path.name for path in folder.parent.iterdir()] == ["folder"]
+
+
+def test_what_is_filled_anew_keeps_other_files_but_no_pictures_of_before(tmp_path: Path) -> None:
+    names = ("a/00000.png", "a/00007.png", "a/notes.png", "other/00003.png", "b.json")
+    for name in names:
+        write_bytes(tmp_path / "out" / name, b"old")
+    with filling(tmp_path / "out") as place:
+        write_bytes(place / "a" / "00000.png", b"new")
+        write_bytes(place / "b.json", b"new")
+    found = {
+        name: (tmp_path / "out" / name).read_bytes() for name in names if (tmp_path / "out" / name).exists()
+    }
+    assert found == {
+        "a/00000.png": b"new",
+        "a/notes.png": b"old",
+        "other/00003.png": b"old",
+        "b.json": b"new",
+    }
+
+
+def test_a_block_that_fails_leaves_a_folder_as_it_was_with_its_own_error(tmp_path: Path) -> None:
+    write_bytes(tmp_path / "out" / "b.json", b"old")
+    with pytest.raises(FileNotFoundError), filling(tmp_path / "out") as place:
+        write_bytes(place / "b.json", b"new")
+        (tmp_path / "nowhere").read_bytes()
+    assert (tmp_path / "out" / "b.json").read_bytes() == b"old"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_folder_that_cannot_be_filled_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match=r"file/out: cannot be written"), filling(tmp_path / "file" / "out"):
+        pass
+    (tmp_path / "out" / "a.json").mkdir(parents=True)
+    with pytest.raises(OutputError, match=r"out: cannot be written"), filling(tmp_path / "out") as place:
+        write_bytes(place / "a.json", b"new")

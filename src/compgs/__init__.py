@@ -28,12 +28,14 @@ started = time.time()
 
 _HOME = {
     "load_scene": "compgs.scene",
-    "train": "compgs.training",
+    "train": "compgs.methods",
     "compress": "compgs.compressing",
     "encode": "compgs.codec",
     "decode": "compgs.codec",
     "render": "compgs.render",
     "evaluate": "compgs.evaluation",
+    "compare": "compgs.evaluation",
+    "report": "compgs.evaluation.reports",
     "export": "compgs.exporting",
     "open_scene": "compgs.formats",
     "load_config": "compgs.config",
@@ -47,6 +49,7 @@ __all__ = [
     "CompGSError",
     "Gaussians",
     "__version__",
+    "compare",
     "compress",
     "decode",
     "encode",
@@ -56,6 +59,7 @@ __all__ = [
     "load_scene",
     "open_scene",
     "render",
+    "report",
     "train",
 ]
 
@@ -65,16 +69,20 @@ if TYPE_CHECKING:
     from compgs.compressing import compress
     from compgs.config import load_config
     from compgs.errors import CompGSError
+    from compgs.evaluation import compare as compare
     from compgs.evaluation import evaluate as evaluate
+    from compgs.evaluation.reports import report as report
     from compgs.exporting import export
     from compgs.formats import open_scene
     from compgs.gaussians import Gaussians
+    from compgs.methods import train
     from compgs.render import render
     from compgs.scene import load_scene
-    from compgs.training import train
 
 
 def __getattr__(name: str) -> object:
+    if name == "methods":
+        return importlib.import_module("compgs.methods")
     if name not in _HOME:
         raise AttributeError(f"module 'compgs' has no attribute {name!r}")
     return getattr(importlib.import_module(_HOME[name]), name)

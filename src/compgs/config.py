@@ -196,6 +196,9 @@ class TrainingConfig:
     appearance_dtype: Literal["float32", "bfloat16"] = "float32"
     # of the steps before the likelihood sees symbols in place of noise (soft then hard)
     hard_rate: Share = 0.8
+    # an affine change of color for each training view, for photographs of differing exposure or white balance: learned
+    # beside the scene, and kept out of the file (`training/exposures.py`)
+    exposure: bool = False
     # of the primitives, that a step does without, where training views are few
     left_out: Annotated[float, Range(0, 0.5)] = 0.2
     # cameras of training views that the file keeps, to look from; 0: none

@@ -11,6 +11,7 @@ CompGSError
 ├── OutputError                 the place to write to: exists, full, not writable
 ├── CheckpointError             a run that cannot be continued
 ├── TrainingError               a training that cannot go on (no visible primitives, not-a-number loss)
+├── ReportError                 runs that hold nothing to report on
 ├── SplatFileError              a .ply, .spz, .sog, .glb or .splat file that does not hold splats, or not whole ones
 └── BitstreamError              the .cgs file
     ├── NotACompGSFile
@@ -67,6 +68,10 @@ class CheckpointError(CompGSError):
 
 class TrainingError(CompGSError):
     """The optimization cannot go on."""
+
+
+class ReportError(CompGSError):
+    """Runs that are to be reported on are missing, not finished or damaged."""
 
 
 class SplatFileError(CompGSError):

@@ -13,27 +13,28 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean
-
-import torch
+from typing import TYPE_CHECKING
 
 from compgs import metrics
 from compgs.cameras import Camera
+from compgs.devices import chosen_device
 from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import between, surround
 from compgs.evaluation.importance import splat_importance
-from compgs.formats import WRITERS, SplatArrays, arrays_of, format_of, open_scene, spz
+from compgs.formats import WRITERS, SplatArrays, format_of, open_scene, spz
 from compgs.formats.baking import Baked, bake
 from compgs.formats.refining import refine as refine_splats
 from compgs.formats.registry import KEEP_WORLD_OFFSET
+from compgs.model.degrees import MAX_DEGREE
 from compgs.model.hybrid_model import HybridModel
-from compgs.model.spherical_harmonics import MAX_DEGREE, coefficients
 from compgs.model.splats import SplatModel
 from compgs.outputs import check_output_file, write_bytes
 from compgs.render import Renderable, render
 
+if TYPE_CHECKING:
+    from compgs.devices import Device
+
 HTML = "html"
-SAME_PICTURE = 100.0  # dB, about what one level in one pixel of one channel comes to
 FITTED_CAMERAS = 96  # of baking; fewer than the coefficients leave colors between them to chance
 COMPARED_CAMERAS = 12  # between the file's own, beside those: baking saw none of them
 LONGEST_SIDE = 800  # pixels, of cameras that baking looks through
@@ -56,8 +57,8 @@ class Exported:
 
     @property
     def mean(self) -> float:
-        """dB, of the cameras; equal pictures count as SAME_PICTURE, unless all are."""
-        return self.worst if self.worst == float("inf") else fmean(min(p, SAME_PICTURE) for p in self.psnr)
+        """dB, of the cameras, as `metrics.mean_psnr` has it."""
+        return metrics.mean_psnr(self.psnr)
 
     @property
     def worst(self) -> float:
@@ -75,7 +76,7 @@ def export(
     max_bytes: int | None = None,
     spz_version: int = 3,
     overwrite: bool = False,
-    device: str | torch.device | None = None,
+    device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Exported:
     """Write a scene as `.ply`, `.spz`, `.sog` or `.glb`, or as a web page (`.html`), by what the path ends in.
@@ -104,7 +105,8 @@ def export(
     if kind == HTML:
         return _export_page(source, path)
     write = functools.partial(spz.encoded, version=spz_version) if kind == "spz" else WRITERS[kind]
-    model = open_scene(source, device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    chosen = chosen_device(device)
+    model = open_scene(source, chosen)
     cameras = own_cameras(model)
     fitted = [smaller(c) for c in (*cameras, *between(cameras, max(0, FITTED_CAMERAS - len(cameras))))]
     compared = (*cameras, *between(cameras, COMPARED_CAMERAS, seed=1))
@@ -120,7 +122,7 @@ def export(
     else:
         baked, dropped = _splats_of(model, (), MAX_DEGREE, count), 0
     data = write(_arrays(baked, model, kind))
-    psnr = tuple(_compared(model, _read_back(data, kind, model), compared, count))
+    psnr = tuple(_compared(model, _read_back(data, kind, model, chosen), compared, count))
     write_bytes(path, data)
     return Exported(len(data), len(baked.importance), baked.splats.degree, dropped, psnr, origin)
 
@@ -207,15 +209,14 @@ def _limited(
 
 def _cut(baked: Baked, degree: int) -> Baked:
     """Without the harmonics above a degree."""
-    rest = baked.splats.rest[:, : coefficients(degree) - 1]
-    return replace(baked, splats=replace(baked.splats, rest=rest))
+    return replace(baked, splats=baked.splats.of_degree(degree))
 
 
 def own_cameras(model: Renderable) -> list[Camera]:
     """Of the world: those that the scene was captured with, where its file names more than one; else all around."""
     if isinstance(model, HybridModel) and len(model.viewpoints) > 1:
         return list(model.viewpoints)
-    around = surround(model.bounds[0].cpu().numpy())
+    around = surround(model.bounds[0])
     return [camera.moved(tuple(-x for x in model.world_offset)) for _, camera in around]
 
 
@@ -239,18 +240,20 @@ def _splats_of(
 
 def _arrays(baked: Baked, model: Renderable, kind: str) -> SplatArrays:
     """With the place of the model's frame where the format has room for it."""
-    return arrays_of(baked.splats, model.world_offset if kind in KEEP_WORLD_OFFSET else (0.0, 0.0, 0.0))
+    origin = model.world_offset if kind in KEEP_WORLD_OFFSET else (0.0, 0.0, 0.0)
+    return replace(baked.splats, world_offset=origin)
 
 
-def _read_back(data: bytes, kind: str, model: Renderable) -> Renderable:
+def _read_back(data: bytes, kind: str, model: Renderable, device: str) -> Renderable:
     """What the bytes are to a reader, in the place of the model that they are compared with."""
-    device = model.bounds[0].device
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, f"written.{kind}")
         file.write_bytes(data)
         again = open_scene(file, device, model.background)
     assert isinstance(again, SplatModel)
-    return again if kind in KEEP_WORLD_OFFSET else replace(again, world_offset=model.world_offset)
+    if kind in KEEP_WORLD_OFFSET:
+        return again
+    return again.at(model.world_offset)
 
 
 def _compared(

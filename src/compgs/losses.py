@@ -25,7 +25,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.numerics.ssim import l1_and_ssim, ssim
+from compgs.numerics.ssim import l1_and_ssim
+from compgs.tensors.ssim import ssim
 
 COMMON_EXTENT = 5.0  # world units
 REVIVED = 0.05  # opacity, well above the rasterizer's cutoff
@@ -40,11 +41,27 @@ class Target:
     """
 
     image: Tensor  # [H, W, 3] uint8
+    counted: Tensor | None = None  # [H, W] bool: pixels to compare; None: all
+    exposure: Tensor | None = None  # [3, 4] of the view, see `exposed`; None: the scene's own
 
     @staticmethod
-    def from_image(image: np.ndarray, device: torch.device | str = "cpu") -> "Target":
-        """From uint8 [H, W, 3]; on the CPU it shares the array's memory where it can."""
-        return Target(torch.from_numpy(np.require(image, requirements=("C", "W"))).to(device))
+    def from_image(
+        image: np.ndarray, device: torch.device | str = "cpu", mask: np.ndarray | None = None
+    ) -> "Target":
+        """From uint8 [H, W, 3] and bool [H, W], True where a pixel counts; on the CPU it shares the arrays' memory
+        where it can.
+        """
+        counted = None if mask is None else _tensor(mask, device)
+        return Target(_tensor(image, device), counted)
+
+
+def _tensor(array: np.ndarray, device: torch.device | str) -> Tensor:
+    return torch.from_numpy(np.require(array, requirements=("C", "W"))).to(device)
+
+
+def exposed(image: Tensor, exposure: Tensor | None) -> Tensor:
+    """[H, W, 3] as a camera of that exposure [3, 4] shows it: a matrix on each color, and an offset."""
+    return image if exposure is None else image @ exposure[:, :3].T + exposure[:, 3]
 
 
 def photometric_loss(
@@ -52,35 +69,46 @@ def photometric_loss(
     target: Target | Tensor,  # [H, W, 3] uint8, or of the image's type and 0 to 1
     ssim_weight: float = 0.2,
 ) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM), as in 3DGS."""
-    y = target.image if isinstance(target, Target) else target
+    """(1 - w) L1 + w (1 - SSIM), as in 3DGS, at the target's exposure; means over its pixels that count
+    (`numerics/ssim.py`).
+    """
+    target = target if isinstance(target, Target) else Target(target)
+    y, counted, image = target.image, target.counted, exposed(image, target.exposure)
     assert image.shape == y.shape, f"image {tuple(image.shape)}, target {tuple(y.shape)}"
     if (
         image.device.type == "cpu"
         and image.dtype == torch.float32
         and y.dtype in (torch.uint8, torch.float32)
     ):
-        return _FusedPhotometric.apply(image, y, ssim_weight)
+        return _FusedPhotometric.apply(image, y, counted, ssim_weight)
     if y.dtype == torch.uint8:
         y = y.to(image.dtype) / 255.0
-    return (1.0 - ssim_weight) * (image - y).abs().mean() + ssim_weight * (1.0 - ssim(image, y))
+    if counted is None:
+        return (1.0 - ssim_weight) * (image - y).abs().mean() + ssim_weight * (1.0 - ssim(image, y))
+    if not counted.any():
+        return 0.0 * image.sum()
+    l1 = (image - y)[counted].abs().mean()
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim(image, y, counted))
 
 
 class _FusedPhotometric(torch.autograd.Function):
     """The gradient is computed along with the loss: both need the same local means."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, counted: Tensor | None, ssim_weight: float
+    ) -> Tensor:
         x, y = image.detach().contiguous().numpy(), target.detach().contiguous().numpy()
-        l1, similarity, gradient = l1_and_ssim(x, y, ssim_weight, want_gradient=ctx.needs_input_grad[0])
+        mask = None if counted is None else counted.numpy()
+        l1, similarity, gradient = l1_and_ssim(x, y, ssim_weight, ctx.needs_input_grad[0], mask)
         if gradient is not None:
             ctx.save_for_backward(torch.from_numpy(gradient))
         return image.new_tensor((1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - similarity))
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        return gradient * grads[0], None, None
+        return gradient * grads[0], None, None, None
 
 
 def scale_regularizer(scales: Tensor, drawn: Tensor | None = None) -> Tensor:

@@ -8,36 +8,44 @@
 - LPIPS: network "vgg" as in 3DGS unless "alex" is asked for, version 0.1 through torchmetrics, inputs in
   [-1, 1]. The releases of 3DGS and CompGS feed [0, 1]: their figures are not comparable.
 
+- With a mask [H, W] bool, True where a pixel counts (`compgs.scene.masks`): PSNR and SSIM are means over the pixels
+  that count; for SSIM the others are black in both images, as what lies outside of an image is. LPIPS: black in both,
+  and the distance is divided by the share of pixels that count.
+
 A metric over views is the mean of the views' metrics.
 """
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from compgs.errors import MissingDependency, install_line
 from compgs.numerics.ssim import l1_and_ssim
 
-# Distance of two batches [1, 3, H, W] in [-1, 1].
-LpipsNetwork = Callable[[Tensor, Tensor], Tensor]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+SAME_PICTURE = 100.0  # dB, about what one level in one pixel of one channel comes to
+
+# Distance of two batches [1, 3, H, W] in [-1, 1], of torch tensors.
+LpipsNetwork = Callable[[Any, Any], Any]
 
 
 class Unavailable(MissingDependency):
     """A metric that cannot be computed here; the message is the reason, for reports to print."""
 
 
-def to_8bit(image: Tensor) -> np.ndarray:
+def to_8bit(image: np.ndarray) -> np.ndarray:
     """[H, W, 3] rendered, 0 to 1 -> uint8: clamped and rounded."""
-    return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+    return np.rint(np.clip(np.asarray(image), 0.0, 1.0) * np.float32(255.0)).astype(np.uint8)
 
 
-def _check(a: np.ndarray, b: np.ndarray) -> None:
+def _check(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None) -> None:
     for image in (a, b):
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise ValueError(
@@ -45,31 +53,51 @@ def _check(a: np.ndarray, b: np.ndarray) -> None:
             )
     if a.shape != b.shape:
         raise ValueError(f"images of different size: {list(a.shape[:2])} and {list(b.shape[:2])} (H, W)")
+    if mask is not None and (mask.dtype != np.bool_ or mask.shape != a.shape[:2] or not mask.any()):
+        raise ValueError(
+            f"expected a mask {list(a.shape[:2])} of bool that is True somewhere, found {mask.dtype} {list(mask.shape)}"
+        )
 
 
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of uint8 images [H, W, 3]."""
-    _check(a, b)
+def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of uint8 images [H, W, 3], over the pixels of a mask or all."""
+    _check(a, b, mask)
     difference = a.astype(np.int32) - b.astype(np.int32)
-    error = float(np.mean(np.square(difference), dtype=np.float64))
+    counted = difference if mask is None else difference[mask]
+    error = float(np.mean(np.square(counted), dtype=np.float64))
     return math.inf if error == 0.0 else 10.0 * math.log10(255.0**2 / error)
 
 
-def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Structural similarity of uint8 images [H, W, 3]; 1 for identical images."""
-    _check(a, b)
+def mean_psnr(values: Sequence[float]) -> float:
+    """dB, of pictures that may be equal: those count as SAME_PICTURE, unless all are; then it is infinite."""
+    return math.inf if min(values) == math.inf else fmean(min(value, SAME_PICTURE) for value in values)
+
+
+def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Structural similarity of uint8 images [H, W, 3], over the pixels of a mask or all; 1 for identical images."""
+    _check(a, b, mask)
     x = a.astype(np.float32) / np.float32(255.0)
     # Writable, as in training: read-only arrays would be compiled for anew.
-    return l1_and_ssim(np.ascontiguousarray(x), np.require(b, requirements=("C", "W")))[1]
+    return l1_and_ssim(np.ascontiguousarray(x), np.require(b, requirements=("C", "W")), counted=mask)[1]
 
 
-def lpips(a: np.ndarray, b: np.ndarray, network: LpipsNetwork | Literal["vgg", "alex"] = "vgg") -> float:
+def lpips(
+    a: np.ndarray,
+    b: np.ndarray,
+    network: LpipsNetwork | Literal["vgg", "alex"] = "vgg",
+    mask: np.ndarray | None = None,
+) -> float:
     """Learned perceptual distance (Zhang et al. 2018) of uint8 images [H, W, 3]; 0 for identical images.
 
     Raises Unavailable where the package or the network's weights are missing; nothing is downloaded.
     """
-    _check(a, b)
+    _check(a, b, mask)
+    if mask is not None:
+        black = mask[:, :, None].astype(np.uint8)
+        return lpips(a * black, b * black, network) / float(mask.mean())
     distance = lpips_network(network) if isinstance(network, str) else network
+    import torch
+
     inputs = [torch.tensor(image).permute(2, 0, 1)[None].float() / 127.5 - 1.0 for image in (a, b)]
     with torch.no_grad():
         return float(distance(*inputs))
@@ -79,11 +107,12 @@ def lpips(a: np.ndarray, b: np.ndarray, network: LpipsNetwork | Literal["vgg", "
 def lpips_network(name: Literal["vgg", "alex"]) -> LpipsNetwork:
     """The network with its published weights: torchmetrics, and a backbone in torch's checkpoint folder."""
     try:
+        import torch
         import torchvision
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     except (ImportError, RuntimeError) as error:  # a torchvision for another torch fails with RuntimeError
         raise Unavailable(
-            f"LPIPS needs torchmetrics and torchvision ({error}): {install_line('lpips')}"
+            f"LPIPS needs torch, torchmetrics and torchvision ({error}): {install_line('lpips')}"
         ) from error
     models = torchvision.models
     weights = {"vgg": models.VGG16_Weights, "alex": models.AlexNet_Weights}[name].IMAGENET1K_V1
@@ -94,7 +123,7 @@ def lpips_network(name: Literal["vgg", "alex"]) -> LpipsNetwork:
     network = LearnedPerceptualImagePatchSimilarity(net_type=name, normalize=False)
     network.eval()
 
-    def distance(a: Tensor, b: Tensor) -> Tensor:
+    def distance(a: "Tensor", b: "Tensor") -> "Tensor":
         network.reset()
         return network(a, b)
 

@@ -57,11 +57,52 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file whole or not at all; folders on the way are made. Raises OutputError."""
+    with _written(path), replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextlib.contextmanager
+def filling(folder: Path) -> Iterator[Path]:
+    """Yields a new folder; what is in it when the block is done takes its place in `folder`, which is made if need be.
+
+    Until then `folder` is as it was, and if the block fails, it stays so. Files of the same names are replaced.
+    Numbered pictures (`00007.png`) that are beside new ones and not among them are of something earlier: they go.
+    Raises OutputError.
+    """
+    with contextlib.ExitStack() as stack:
+        with _written(folder):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            place = tempfile.TemporaryDirectory(prefix=f".{folder.name[:40]}.", dir=folder.parent)
+        temporary = Path(stack.enter_context(place))
+        yield temporary
+        with _written(folder):
+            _move_files(temporary, folder)
+
+
+@contextlib.contextmanager
+def _written(path: Path) -> Iterator[None]:
+    """Raises OutputError for what the system refuses inside."""
     try:
-        with replacing(path) as temporary:
-            temporary.write_bytes(data)
+        yield
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def _move_files(source: Path, target: Path) -> None:
+    files = sorted(path for path in source.rglob("*") if path.is_file())
+    for file in files:
+        place = target / file.relative_to(source)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(file, place)
+    new = {target / file.relative_to(source) for file in files}
+    for parent in {path.parent for path in new if _numbered(path)}:
+        for old in parent.iterdir():
+            if _numbered(old) and old not in new:
+                _remove(old)
+
+
+def _numbered(path: Path) -> bool:
+    return path.suffix == ".png" and len(path.stem) == 5 and path.stem.isdigit()
 
 
 def write_json(path: Path, content: dict[str, Any] | list[Any]) -> None:

@@ -5,19 +5,22 @@ Training optimizes it, the encoder turns it into a file, `as_hybrid_model` into 
 
 import copy
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.config import Config
+from compgs.devices import placed
 from compgs.entropy.models import EntropyModel, Quantized, starting_residuals
 from compgs.model.constants import SHARED_RESIDUALS
-from compgs.model.heads import HeadDimensions, make_heads
+from compgs.model.head_weights import HeadDimensions
 from compgs.model.hybrid_model import HybridModel
-from compgs.model.primitives import Primitives, every_slot
-from compgs.numerics.linear import Reader
 from compgs.stored_weights import StoredWeights
+from compgs.tensors.heads import make_heads
+from compgs.tensors.linear import Reader
+from compgs.tensors.primitives import Primitives, every_slot
 
 
 class OwnResiduals:
@@ -214,30 +217,28 @@ class TrainedModel(nn.Module):
 
     @torch.no_grad()
     def as_hybrid_model(self, *, stored_weights: bool = True) -> HybridModel:
-        """What a decoder would render, without going through a file."""
+        """What a decoder would render, without going through a file, on the device of this model."""
         primitives = self.primitives(self.quantized(stored_weights=stored_weights))
         kept = self.mask.view(-1)
         heads = copy.deepcopy(self.heads)
         if stored_weights:
             for name, value in self.stored_head_weights().items():
                 heads.get_parameter(name).copy_(value)
-        chosen = Primitives(
-            primitives.positions,
-            primitives.log_scales,
-            primitives.references,
-            primitives.residuals[kept],
-            primitives.anchor_index[kept],
-            primitives.voxel_size,
+        chosen = replace(
+            primitives,
+            residuals=primitives.residuals[kept],
+            anchor_index=primitives.anchor_index[kept],
         )
-        return HybridModel(
-            chosen,
-            heads.requires_grad_(False),
+        model = HybridModel(
+            chosen.arrays(),
+            heads.weights(),
             self.distance_unit,
             self.background,
             world_offset=self.world_offset,
             viewpoints=self.viewpoints[: self.config.training.viewpoints],
             up=self.up,
         )
+        return placed(model, self.device)
 
     @torch.no_grad()
     def estimated_bits(self) -> dict[str, float]:

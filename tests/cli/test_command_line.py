@@ -23,9 +23,10 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
     return code, captured.out, captured.err
 
 
-def test_the_nine_commands_are_there() -> None:
+def test_the_commands_are_there() -> None:
     assert NAMES == [
-        "train", "encode", "decode", "render", "evaluate", "export", "serve", "info", "demo-scene",
+        "reconstruct", "train", "compress", "encode", "decode", "render", "evaluate", "view", "compare", "report",
+        "benchmark", "export", "serve", "info", "demo-scene",
     ]  # fmt: skip
 
 
@@ -111,7 +112,15 @@ def test_options_with_numbers_are_found() -> None:
 def test_rubbish_in_place_of_a_number_is_named_with_its_option_and_what_was_expected(
     capsys: pytest.CaptureFixture[str], command: str, option: str, count: int
 ) -> None:
-    output = {"render": ["-o", "out"], "export": ["out.ply"]}.get(command, [])
+    needed = {
+        "render": ["-o", "out"],
+        "reconstruct": ["-o", "out"],
+        "export": ["out.ply"],
+        "compare": ["other"],
+        "report": ["-o", "out.html"],
+        "benchmark": ["-o", "out"],
+    }
+    output = needed.get(command, [])
     code, _, err = outcome(capsys, command, "something", *output, option, *["rubbish"] * count)
     assert code == 2
     assert_short(err)
@@ -160,7 +169,7 @@ DEMO = ["demo-scene", "scene"]
         ([*DEMO, "--seed", "-1"], "--seed -1: expected 0 to 2147483647"),
         (
             ["trian", "scene"],
-            "trian: there is no such command (did you mean train?); there are train, encode",
+            "trian: there is no such command (did you mean train?); there are reconstruct, train",
         ),
         (["--steps", "3"], "--steps: there is no such command"),
     ],

@@ -18,10 +18,9 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
 @pytest.fixture
 def ply(tmp_path: Path) -> Path:
     import numpy as np
-    import torch
 
     from compgs.formats import write_ply
-    from compgs.model.splats import Splats
+    from compgs.model.splats import SplatArrays
 
     rng = np.random.default_rng(0)
     count = 150
@@ -34,7 +33,7 @@ def ply(tmp_path: Path) -> Path:
         "rest": np.zeros((count, 0, 3)),
     }
     path = tmp_path / "cloud.ply"
-    write_ply(Splats(**{k: torch.tensor(v, dtype=torch.float32) for k, v in arrays.items()}), path)
+    write_ply(SplatArrays(**{k: v.astype(np.float32) for k, v in arrays.items()}), path)
     return path
 
 

@@ -9,17 +9,16 @@ import torch
 
 import compgs.codec
 from compgs.cli.decode import Decode
-from compgs.cli.methods import METHODS
 from compgs.cli.render import Render
 from compgs.config import Config, ModelConfig
 from compgs.formats import read_ply
-from compgs.model.splats import SplatModel, Splats
+from compgs.methods import write
+from compgs.model.splats import SplatArrays, SplatModel
 from compgs.trained_model import TrainedModel
 
 
 def test_the_circle_is_given_in_the_world_and_looks_at_the_model() -> None:
-    generator = torch.Generator().manual_seed(0)
-    positions = torch.randn(200, 3, generator=generator)
+    positions = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
     command = Render(file=Path("a.cgs"), output=Path("out"), frames=4)
     near = command.circle(SimpleNamespace(bounds=(positions, None), world_offset=(0.0, 0.0, 0.0)))
     offset = (4.2e6, -5.1e5, 3e3)
@@ -46,8 +45,9 @@ def test_decoded_arrays_say_where_they_count_from(tmp_path: Path, monkeypatch: p
 
 
 def test_the_splats_file_of_a_run_is_in_world_coordinates(tmp_path: Path) -> None:
-    means = torch.tensor([[1.0, 2.0, 3.0], [0.0, 0.5, -0.25]])
-    rest, quaternions = torch.zeros(2, 0, 3), torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1)
-    splats = Splats(means, torch.zeros(2, 3), quaternions, torch.zeros(2), torch.zeros(2, 3), rest)
-    METHODS["3dgs"].write(SplatModel(splats, (0.0, 0.0, 0.0), (1000.0, -64.0, 0.5)), tmp_path / "a.ply")
+    means = np.array([[1.0, 2.0, 3.0], [0.0, 0.5, -0.25]], np.float32)
+    quaternions = np.array([[1.0, 0, 0, 0]] * 2, np.float32)
+    others = (np.zeros(shape, np.float32) for shape in ((2,), (2, 3), (2, 0, 3)))
+    splats = SplatArrays(means, np.zeros((2, 3), np.float32), quaternions, *others, (1000.0, -64.0, 0.5))
+    write(SplatModel(splats, (0.0, 0.0, 0.0)), tmp_path / "a.ply", method="3dgs")
     assert read_ply(tmp_path / "a.ply").means.tolist() == [[1001.0, -62.0, 3.5], [1000.0, -63.5, 0.25]]

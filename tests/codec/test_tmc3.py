@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from compgs.codec.anchor_order import canonical_order
 from compgs.codec.reader import file_info, read_content
-from compgs.codec.tmc3 import ENCODER_OPTIONS, decode_positions_tmc3, encode_positions_tmc3
+from compgs.codec.tmc3 import ASKED_BY, ENCODER_OPTIONS, decode_positions_tmc3, encode_positions_tmc3
 from compgs.codec.writer import write_content
 from compgs.errors import CorruptSection, MissingDependency, NotEncodable
 
@@ -62,6 +62,7 @@ def install(
     program = folder / "tmc3"
     program.write_text(text or STAND_IN.format(python=sys.executable, form=form, fail=fail))
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv(ASKED_BY, "1")
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
 
 
@@ -88,10 +89,26 @@ def test_the_encoder_is_asked_for_a_lossless_octree() -> None:
 
 def test_without_the_program_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv(ASKED_BY, "1")
     with pytest.raises(MissingDependency, match=r"tmc3.*PATH"):
         encode_positions_tmc3(cloud())
     with pytest.raises(MissingDependency, match="octree coder"):
         decode_positions_tmc3(bytes(100), 8)
+
+
+@pytest.mark.parametrize("value", [None, "", "0"])
+def test_no_file_makes_the_program_run_unless_somebody_asked_for_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, value: str | None
+) -> None:
+    trace = tmp_path / "ran"
+    install(monkeypatch, tmp_path, text=f"#!/bin/sh\ntouch {trace}\n")
+    if value is None:
+        monkeypatch.delenv(ASKED_BY)
+    else:
+        monkeypatch.setenv(ASKED_BY, value)
+    with pytest.raises(MissingDependency, match=r"only when .* asked for: give --tmc3, or set COMPGS_TMC3=1"):
+        decode_positions_tmc3(bytes(100), 8)
+    assert not trace.exists()
 
 
 def test_a_failing_program_is_quoted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -153,7 +170,8 @@ def test_a_file_with_g_pcc_positions_holds_the_same_scene(
 
 
 @pytest.mark.skipif(shutil.which("tmc3") is None, reason="tmc3 (TMC13) is not on PATH")
-def test_real_g_pcc_is_lossless() -> None:
+def test_real_g_pcc_is_lossless(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(ASKED_BY, "1")
     points = cloud(3000)
     data = encode_positions_tmc3(points)
     assert (decode_positions_tmc3(data, len(points)) == points[canonical_order(points)]).all()

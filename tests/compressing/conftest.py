@@ -1,40 +1,45 @@
 """Scenes of a few hundred splats: a ball to walk around, and a room to stand in."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from compgs.formats import write_ply
-from compgs.model.splats import SplatModel, Splats
+from compgs.model.splats import SplatArrays, SplatModel
 
 FLOATERS = 12
 
 
-def splats_at(means: np.ndarray, size: float, opacity: float = 0.95, seed: int = 0) -> Splats:
+def splats_at(means: np.ndarray, size: float, opacity: float = 0.95, seed: int = 0) -> SplatArrays:
     """Round splats of one size, colored by where they are."""
     count = len(means)
     turns = np.random.default_rng(seed).normal(size=(count, 4))
     colors = np.clip(0.5 + 0.4 * means / np.abs(means).max(), 0.05, 0.95)
-    return Splats(
-        means=torch.tensor(means, dtype=torch.float32),
-        log_scales=torch.full((count, 3), float(np.log(size))),
-        quaternions=torch.tensor(turns, dtype=torch.float32),
-        opacity_logits=torch.full((count,), float(np.log(opacity / (1 - opacity)))),
-        dc=torch.tensor((colors - 0.5) / 0.28209479177387814, dtype=torch.float32),
-        rest=torch.zeros(count, 3, 3),
+    return SplatArrays(
+        means=means.astype(np.float32),
+        log_scales=np.full((count, 3), np.log(size), np.float32),
+        quaternions=turns.astype(np.float32),
+        opacity_logits=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
+        dc=((colors - 0.5) / 0.28209479177387814).astype(np.float32),
+        rest=np.zeros((count, 3, 3), np.float32),
     )
 
 
-def joined(*parts: Splats) -> Splats:
-    return Splats(**{name: torch.cat([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+def joined(*parts: SplatArrays) -> SplatArrays:
+    return SplatArrays(
+        **{
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in vars(parts[0])
+            if name != "world_offset"
+        }
+    )
 
 
 @pytest.fixture(scope="session")
-def make_splats() -> Callable[..., Splats]:
+def make_splats() -> Callable[..., SplatArrays]:
     """`make_splats(means, size)`."""
     return splats_at
 
@@ -56,7 +61,7 @@ def ball() -> Made:
     surface = splats_at(directions, 0.12)
     far = splats_at(rng.normal(size=(FLOATERS, 3)) * 60, 0.12, opacity=0.02)
     splats = joined(surface, far)
-    splats = Splats(**{**vars(splats), "means": splats.means + torch.tensor([3.0, 0.0, 0.0])})
+    splats = replace(splats, means=splats.means + np.array([3.0, 0.0, 0.0], np.float32))
     return Made(SplatModel(splats, (0.0, 0.0, 0.0)), np.arange(300))
 
 

@@ -16,9 +16,10 @@ from compgs.config import Config, ModelConfig, TrainingConfig
 from compgs.errors import CheckpointError, ConfigError, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import camera_entry, read_cameras
 from compgs.formats import open_scene
+from compgs.gaussians import Gaussians
 from compgs.render import render
-from compgs.render.reference import rasterize_reference
 from compgs.render.settings import RasterSettings
+from compgs.tensors.reference import rasterize_reference
 from compgs.training import TrainingStatus
 
 LOOKING = Looking(views=10, held_out=3, width=48, height=36)
@@ -41,7 +42,7 @@ def test_the_file_decodes_and_its_quality_is_as_reported(done, ball_ply: Path) -
     ours, splats = compgs.decode(done.file), open_scene(ball_ply)
     found = []
     for _, camera in read_cameras(done.folder / "cameras.json"):
-        pictures = [np.rint(render(m, camera).image.clamp(0, 1).numpy() * 255.0) for m in (ours, splats)]
+        pictures = [np.rint(np.clip(render(m, camera).image, 0, 1) * 255.0) for m in (ours, splats)]
         found.append(10 * np.log10(255**2 / np.mean((pictures[0] - pictures[1]) ** 2)))
     assert len(found) == 3
     np.testing.assert_allclose(done.results.psnr, np.mean(found), atol=1e-3)
@@ -73,8 +74,9 @@ def test_what_is_trained_on_are_renderings_of_the_splats(
     assert (len(scene.train_views), len(scene.test_views)) == (4, 2)
     settings = RasterSettings(background=looking.background)
     for view in (scene.train_views[1], scene.test_views[0]):
-        gaussians = begun.splats.gaussians(view.camera)
-        truth = metrics.to_8bit(rasterize_reference(gaussians, view.camera, settings).image)
+        arrays = vars(begun.splats.gaussians(view.camera)).values()
+        gaussians = Gaussians(*map(torch.from_numpy, arrays))
+        truth = metrics.to_8bit(rasterize_reference(gaussians, view.camera, settings).image.numpy())
         assert view.image.shape == (36, 48, 3)
         assert np.abs(view.image.astype(int) - truth.astype(int)).max() <= 1
         assert view.image is view.image  # kept
@@ -189,11 +191,11 @@ def test_splats_far_from_the_origin_are_compressed_there(ball, config: Config, t
     from compgs.formats import write_ply
 
     source = tmp_path / "far.ply"
-    write_ply(ball.model.splats, source, world_offset=(65536.0, 0.0, -131072.0))
+    write_ply(ball.model.at((65536.0, 0.0, -131072.0)).splats, source)
     output = tmp_path / "far.cgs"
     short = replace(config, training=replace(config.training, steps=3))
     begun = begin(source, output, short, replace(LOOKING, views=3, held_out=1))
     begun.train()
     centers = np.stack([c.center for c in compgs.decode(output).viewpoints])
     assert np.linalg.norm(centers - [65539, 0, -131072], axis=1).max() < 5
-    assert torch.isfinite(compgs.decode(output).bounds[0]).all()
+    assert np.isfinite(compgs.decode(output).bounds[0]).all()

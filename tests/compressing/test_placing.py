@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from compgs.cameras import Camera
 from compgs.compressing.placing import Placed, cover, place_cameras
@@ -12,7 +11,7 @@ from compgs.compressing.probing import Probe, probe
 from compgs.compressing.shape import shape_of, weighted_quantile
 from compgs.compressing.surroundings import Lens, Surroundings
 from compgs.errors import SceneError
-from compgs.model.splats import SplatModel, Splats
+from compgs.model.splats import SplatModel
 
 LENS = Lens(64, 48)
 UP = np.array([0.0, -1.0, 0.0])
@@ -49,14 +48,15 @@ def test_a_weighted_quantile_is_that_of_values_that_come_more_often() -> None:
 
 def test_every_splat_that_matters_is_seen_by_several_cameras(ball, around_ball: Placed) -> None:
     """A splat on a sphere is seen from where it faces the camera; no probe is asked."""
-    normals = ball.model.splats.means[ball.solid].numpy() - [3, 0, 0]
+    normals = ball.model.splats.means[ball.solid] - [3, 0, 0]
     times = np.zeros(len(normals))
     for camera in around_ball.train:
         local = (normals + np.array([3, 0, 0])) @ camera.rotation.T + camera.translation
         pixels = local[:, :2] / local[:, 2:] * camera.fx + [camera.cx, camera.cy]
         inside = (local[:, 2] > 0) & ((pixels >= 0) & (pixels <= [camera.width, camera.height])).all(1)
         times += inside & ((normals * (camera.center - [3, 0, 0] - normals)).sum(1) > 0)
-    assert times.min() >= 1 and (times >= 2).mean() > 0.97 and np.median(times) >= 4
+    below = normals[:, 1] > 0.7  # y is down; from straight below hardly anybody looks
+    assert times[~below].min() >= 2 and (times >= 2).mean() > 0.95 and np.median(times) >= 5
 
 
 def test_cameras_of_an_object_stand_around_it_and_mostly_above(ball, around_ball: Placed) -> None:
@@ -98,13 +98,13 @@ def test_a_seed_gives_the_same_cameras_and_another_one_others(ball) -> None:
 def test_cameras_are_of_the_world_where_the_model_is_far_from_its_origin(ball) -> None:
     offset = (1e5, 0.0, -2e5)
     here = place_cameras(ball.model, 4, 2, lens=LENS)
-    there = place_cameras(replace(ball.model, world_offset=offset), 4, 2, lens=LENS)
+    there = place_cameras(ball.model.at(offset), 4, 2, lens=LENS)
     np.testing.assert_allclose(centers(there.train) - offset, centers(here.train), atol=1e-6)
 
 
 def test_splats_that_hardly_show_are_refused(ball) -> None:
     splats = ball.model.splats
-    faint = Splats(**{**vars(splats), "opacity_logits": torch.full_like(splats.opacity_logits, -8.0)})
+    faint = replace(splats, opacity_logits=np.full_like(splats.opacity_logits, -8.0))
     with pytest.raises(SceneError, match="no place was found"):
         place_cameras(SplatModel(faint, (0.0, 0.0, 0.0)), 2, 1, lens=LENS)
 

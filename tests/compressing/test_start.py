@@ -1,7 +1,6 @@
 """Where anchors start: about as many as asked for, where splats are seen, in their colors."""
 
 import numpy as np
-import torch
 
 from compgs.cameras import Camera
 from compgs.compressing.start import seen_weights, start_points, voxel_size_for
@@ -25,7 +24,7 @@ def test_each_point_becomes_one_anchor(ball) -> None:
 
 def test_a_voxel_has_the_mean_color_of_its_splats(make_splats) -> None:
     splats = make_splats(np.array([[0.0, 0, 0], [0.1, 0, 0], [5.0, 0, 0]]), 0.1)
-    splats.dc[:] = torch.tensor([[0.2, 0.0, 0.0], [-0.2, 0.4, 0.0], [0.0, 0.0, 0.0]])
+    splats.dc[:] = np.array([[0.2, 0.0, 0.0], [-0.2, 0.4, 0.0], [0.0, 0.0, 0.0]])
     points, _ = start_points(SplatModel(splats, (0.0, 0.0, 0.0)), np.array([3.0, 1.0, 1.0]), 2)
     expected = 0.5 + 0.28209479177387814 * (0.75 * np.array([0.2, 0, 0]) + 0.25 * np.array([-0.2, 0.4, 0]))
     row = np.argmin(points.positions[:, 0])
@@ -47,6 +46,6 @@ def test_a_given_voxel_size_is_used(ball) -> None:
 
 def test_points_are_of_the_world(ball) -> None:
     offset = (1e5, 0.0, -2e5)
-    far = SplatModel(ball.model.splats, (0.0, 0.0, 0.0), offset)
+    far = ball.model.at(offset)
     here, there = (start_points(model, np.ones(312), 80)[0].positions for model in (ball.model, far))
     np.testing.assert_allclose(there - offset, here, atol=1e-6)

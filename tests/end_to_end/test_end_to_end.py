@@ -18,6 +18,7 @@ from compgs.cli import train as train_command
 from compgs.cli.main import main
 from compgs.cli.settings import with_settings
 from compgs.evaluation import camera_path
+from compgs.evaluation.reduction import reduce_file
 from compgs.metrics import psnr, to_8bit
 from compgs.render import render
 from compgs.training import TrainingStatus
@@ -95,6 +96,14 @@ def test_a_run_and_its_file_become_the_same_smaller_file_and_the_loss_is_stated(
     file = str(run / "tiny.cgs")
     assert main(["encode", file, "-o", str(tmp_path / "b.cgs"), *smaller, "--scene", str(scene_folder)]) == 0
     assert (tmp_path / "a.cgs").read_bytes() == (tmp_path / "b.cgs").read_bytes()
+    scene = compgs.load_scene(scene_folder)
+    by_training, by_held_out = (
+        reduce_file((run / "tiny.cgs").read_bytes(), drop=0.6, coarser=2, cameras=[v.camera for v in views])[
+            0
+        ]
+        for views in (scene.train_views, scene.test_views)
+    )
+    assert (tmp_path / "a.cgs").read_bytes() == by_training != by_held_out
     for out in (of_run, capsys.readouterr().out):
         assert "the 35 training views" in out
         assert "held-out photographs" in out and "new renderings against old ones" in out

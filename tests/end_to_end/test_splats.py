@@ -51,7 +51,9 @@ def test_results_are_of_the_file(run: Path) -> None:
     assert results["file"] == "tiny.ply"
     assert results["bytes"] == (run / "tiny.ply").stat().st_size == sum(results["components"].values())
     assert results["components"]["harmonics"] == 180 * splats
-    assert results["splats"] == json.loads((run / "training.json").read_text())["splats"] == splats
+    training = json.loads((run / "training.json").read_text())
+    assert results["splats"] == training["splats"] == training["curve"]["primitives"][-1] == splats
+    assert training["curve"]["step"][-1] == training["steps"]
     assert results["bits_per_splat"] == pytest.approx(8 * results["bytes"] / splats)
     assert results["anchors"] is results["bits_per_anchor"] is results["coupled_primitives"] is None
 

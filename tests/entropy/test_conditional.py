@@ -91,6 +91,7 @@ def test_masked_slots_cost_nothing_and_pull_at_nothing():
     assert all(float(p.grad.abs().sum()) == 0.0 for p in net.parameters() if p.grad is not None)
 
 
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
 def test_bits_and_gradients_do_not_depend_on_the_number_of_threads():
     threads = numba.get_num_threads()
     many = run(torch.float32, bits=13, with_noise=True, masked=True)

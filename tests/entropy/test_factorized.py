@@ -101,6 +101,7 @@ def test_training_finds_the_histogram_of_noisy_data():
     torch.testing.assert_close(found, truth, rtol=0.0, atol=0.02)
 
 
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
 def test_gradients_are_the_same_bits_with_one_thread_and_with_several():
     z = torch.randn(3000, 3, generator=torch.Generator().manual_seed(2)) * 5
     threads = numba.get_num_threads()

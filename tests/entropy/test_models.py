@@ -6,6 +6,7 @@ import torch
 
 from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy import STREAMS, EntropyModel
+from compgs.entropy.gaussian import gaussian_bits, scale_from_index
 from compgs.entropy.models import starting_residuals
 from compgs.entropy.network import EntropyNetwork
 
@@ -99,6 +100,79 @@ def test_without_noise_training_sees_the_density_at_the_symbols_and_has_gradient
     torch.stack([b.sum() for b in bits.values()]).sum().backward()
     assert all(float(y.grad.abs().sum()) > 0 for y in latents)
     assert float(entropy.residual_density.logits.grad.abs().sum()) > 0
+
+
+def test_in_training_the_likelihood_sees_latents_and_hyperpriors_with_noise_in_place_of_rounding(entropy):
+    f, c, g = latents()
+    bits = entropy(f, c, g, rate=True, noise=lambda like: torch.full_like(like, 0.3)).bits
+    z = entropy.reference_analysis(f), entropy.residual_analysis(g)
+    for name, y, density in zip(
+        ("reference_hyper", "residual_hyper"),
+        z,
+        (entropy.reference_density, entropy.residual_density),
+        strict=True,
+    ):
+        # The mass of a unit interval lies in two bins, in proportion.
+        p = density.probabilities().double()
+        left = (y.double() + 0.3).floor()
+        part = y.double() + 0.3 - left
+        column = (left.long() + p.shape[1] // 2).t()
+        mass = p.gather(1, column).t() * (1 - part) + p.gather(1, column + 1).t() * part
+        torch.testing.assert_close(bits[name].double(), -mass.log2().sum(1), rtol=1e-4, atol=1e-4)
+    for name, y, network, context in (
+        ("reference", f, entropy.reference_network, z[0].round()),
+        ("covariance", c, entropy.covariance_network, entropy(f, c, g, rate=False).references),
+    ):
+        mean, scale = network(context)
+        torch.testing.assert_close(bits[name], gaussian_bits(y - mean + 0.3, scale), rtol=1e-3, atol=1e-2)
+
+
+def test_scales_start_anew_at_the_spread_around_what_the_hyperprior_expects(entropy):
+    """In octaves of a step; a channel that hardly moves gets a fifth of a step."""
+    references = latents(400)[0] + torch.tensor([0.0, 5.0, 0.0, 0.0, 0.0, 0.0])
+    references[:, 3] = 1.0
+    with torch.no_grad():
+        for layer in (entropy.reference_analysis.first, entropy.reference_analysis.second):
+            layer.weight.mul_(2.0)
+        entropy.reference_network.weights[-1][3] = 0
+    weight, bias = entropy.restart_reference_scales(references)
+    with torch.no_grad():
+        mean, scale = entropy.reference_network(entropy.reference_analysis(references).round())
+    spread = (references - mean).double().std(0, correction=0)
+    plain = references.double().std(0, correction=0)
+    assert spread[3] < 1e-3
+    assert ((spread - plain).abs() > 0.02 * plain.clamp_min(0.1)).any()
+    torch.testing.assert_close(
+        scale_from_index(scale).double(), spread.clamp_min(0.2).expand(400, -1), rtol=1e-3, atol=0
+    )
+    assert weight is entropy.reference_network.weights[-1] and bias is entropy.reference_network.biases[-1]
+
+
+def test_a_file_is_estimated_by_the_histograms_of_its_hyperpriors(entropy):
+    with torch.no_grad():
+        f, c, g = latents()
+        bits = entropy(f, c, g, rate=True).bits["reference_hyper"]
+        symbols = entropy.reference_analysis(f).round().to(torch.int64)
+    expected = [
+        sum(-math.log2(float((column == column[i]).double().mean())) for column in symbols.unbind(1))
+        for i in range(len(f))
+    ]
+    assert bits.tolist() == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_new_anchor_starts_with_the_residuals_that_the_prior_expects(entropy):
+    start = starting_residuals(entropy, MODEL)
+    assert start.any()
+    mean, _ = entropy.residual_network(torch.zeros(1, 9))
+    if not entropy.residual_network.blocks:
+        torch.testing.assert_close(start, mean[0].detach())
+    assert entropy.residual_network.biases[-1][:12].tolist() == start.tolist()
+
+
+def test_statistics_are_all_parameters_but_the_steps(entropy):
+    names = {id(p): name for name, p in entropy.named_parameters()}
+    found = {names[id(p)] for p in entropy.statistics()}
+    assert found == set(names.values()) - {"log_covariance_step"}
 
 
 def test_residuals_are_predicted_from_references_and_then_their_hyperprior(entropy):

@@ -123,3 +123,17 @@ def test_one_or_two_cameras_have_others_between_them(count: int) -> None:
     assert len(more) == 4 and all(np.isfinite(camera.world_to_camera).all() for camera in more)
     if count == 1:
         np.testing.assert_allclose(more[0].world_to_camera, ring[0].world_to_camera, atol=1e-12)
+
+
+def test_the_circle_is_around_three_quarters_of_the_positions() -> None:
+    """Of a hundred positions, eighty lie one unit from the middle, the others far off in the background."""
+    chance = np.random.default_rng(0)
+    directions = chance.normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    near, far = directions[:40], 60 * directions[40:]
+    middle = np.array([1.0, 2.0, 3.0])
+    positions = middle + np.concatenate([near, -near, far, -far])
+    for _, camera in orbit(positions, frames=4, width=64, height=48, elevation=30.0, distance=2.0):
+        away = camera.center - middle
+        assert np.linalg.norm(away) == pytest.approx(2.0, rel=0.05)
+        assert -away[1] == pytest.approx(1.0, rel=0.1)  # up is -y

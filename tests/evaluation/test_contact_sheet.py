@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from compgs.evaluation.contact_sheet import CELL_WIDTH, COLUMN_WIDTH, MARGIN, contact_sheet
+from compgs.evaluation.contact_sheet import CELL_WIDTH, COLUMN_WIDTH, MARGIN, contact_sheet, striped
 
 
 def flat(height: int, width: int, color: tuple[int, int, int]) -> np.ndarray:
@@ -43,3 +43,13 @@ def test_wide_images_are_reduced() -> None:
     assert right - left + 1 == CELL_WIDTH
     assert bottom - top + 1 == CELL_WIDTH // 4
     assert sheet.dtype == np.uint8
+
+
+def test_what_does_not_count_is_striped_and_the_rest_is_as_it_was() -> None:
+    image, mask = flat(40, 60, (200, 100, 50)), np.ones((40, 60), dtype=bool)
+    mask[10:30, 20:50] = False
+    shown = striped(image, mask)
+    assert shown.dtype == np.uint8
+    np.testing.assert_array_equal(shown[mask], image[mask])
+    assert {tuple(color) for color in shown[~mask].tolist()} == {(100, 50, 25), (227, 177, 152)}
+    assert striped(image, None) is image

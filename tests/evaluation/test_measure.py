@@ -2,15 +2,15 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
+from compgs import metrics
 from compgs.cameras import Camera
 from compgs.errors import OutputError, SceneError
 from compgs.evaluation import evaluate as package_evaluate
@@ -54,7 +54,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     module = "compgs.evaluation.measure"
 
     def render(model: StandIn, camera: Camera) -> SimpleNamespace:
-        return SimpleNamespace(image=torch.full((camera.height, camera.width, 3), model.level))
+        return SimpleNamespace(image=np.full((camera.height, camera.width, 3), model.level, np.float32))
 
     monkeypatch.setattr(f"{module}.open_scene", lambda path, device, background: StandIn(100 / 255))
     monkeypatch.setattr(f"{module}.component_bytes", lambda path: {"positions": 300, "weights": 700})
@@ -63,11 +63,45 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_psnr_is_the_mean_over_views_of_a_closed_form(file: Path) -> None:
-    results = evaluate(file, make_scene([101, 110]), device="cpu")
-    psnrs = [20 * math.log10(255 / 1), 20 * math.log10(255 / 10)]
+    results = evaluate(file, make_scene([101, 110, 104, 155]), device="cpu")
+    psnrs = [20 * math.log10(255 / error) for error in (1, 10, 4, 55)]
     assert [view.psnr for view in results.per_view] == pytest.approx(psnrs, abs=1e-6)
-    assert results.psnr == pytest.approx(sum(psnrs) / 2, abs=1e-6)
-    assert 0 < results.ssim <= 1
+    assert results.psnr == pytest.approx(sum(psnrs) / 4, abs=1e-6)
+
+
+def test_seconds_are_the_median_and_lpips_is_of_all_views_or_of_none(file: Path) -> None:
+    results = evaluate(file, make_scene([101, 110, 50]), device="cpu")
+    views = [
+        replace(view, render_seconds=seconds, lpips=distance)
+        for view, seconds, distance in zip(results.per_view, (1.0, 9.0, 2.0), (0.1, 0.5, 0.3), strict=True)
+    ]
+    assert replace(results, per_view=tuple(views)).render_seconds == 2.0
+    assert replace(results, per_view=tuple(views)).lpips == pytest.approx(0.3)
+    views[1] = replace(views[1], lpips=None)
+    assert replace(results, per_view=tuple(views)).lpips is None
+
+
+def test_the_file_is_shown_on_the_background_of_the_scene(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = replace(make_scene([101]), background=(1.0, 0.5, 0.25))
+    asked = []
+    monkeypatch.setattr(
+        "compgs.evaluation.measure.open_scene",
+        lambda path, device, background: asked.append(background) or StandIn(0.5),
+    )
+    evaluate(file, scene, device="cpu")
+    assert set(asked) == {(1.0, 0.5, 0.25)}
+
+
+def test_ssim_is_the_mean_over_views(file: Path) -> None:
+    scene = make_scene([101, 110, 50, 20])
+    results = evaluate(file, scene, device="cpu")
+    flat = np.full_like(scene.test_views[0].image, 100)
+    each = [metrics.ssim(flat, view.image) for view in scene.test_views]
+    assert [view.ssim for view in results.per_view] == pytest.approx(each)
+    assert results.ssim == pytest.approx(sum(each) / 4, abs=1e-9)
+    assert max(each) - results.ssim > 0.05 < abs(results.ssim - np.median(each))
 
 
 def test_rates_are_of_the_whole_file(file: Path) -> None:
@@ -120,7 +154,7 @@ def test_a_scene_without_held_out_views_is_refused(file: Path) -> None:
 def test_missing_lpips_is_reported_with_its_reason(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from compgs import metrics
 
-    def unavailable(*_: object) -> float:
+    def unavailable(*_: object, **__: object) -> float:
         raise metrics.Unavailable("no weights here")
 
     monkeypatch.setattr(metrics, "lpips", unavailable)
@@ -147,3 +181,51 @@ def test_progress_counts_the_views(file: Path) -> None:
         file, make_scene([1, 2]), device="cpu", progress=lambda done, total: seen.append((done, total))
     )
     assert seen == [(1, 2), (2, 2)]
+
+
+def masked(scene: Scene, masks: dict[int, np.ndarray]) -> Scene:
+    views = tuple(
+        replace(view, counted=masks.get(i), pixels=spoiled(view.image, masks.get(i)))
+        for i, view in enumerate(scene.test_views)
+    )
+    return replace(scene, test_views=views)
+
+
+def spoiled(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """White where the mask leaves pixels out."""
+    return image if mask is None else np.where(mask[:, :, None], image, np.uint8(255))
+
+
+def test_masked_pixels_do_not_count_and_the_report_shows_them(file: Path, tmp_path: Path) -> None:
+    """Whatever stands there, the view is as good as one without it."""
+    mask = np.ones((24, 32), dtype=bool)
+    mask[5:15, 8:20] = False
+    output = tmp_path / "report"
+    results = evaluate(file, masked(make_scene([110, 110]), {1: mask}), output=output, device="cpu")
+    whole, half = results.per_view
+    assert half.psnr == whole.psnr == pytest.approx(20 * math.log10(255 / 10), abs=1e-6)
+    assert half.ssim == pytest.approx(whole.ssim, abs=0.02)
+    assert [path.name for path in (output / "test" / "masks").iterdir()] == ["00001.png"]
+    written = np.asarray(Image.open(output / "test" / "masks" / "00001.png"))
+    np.testing.assert_array_equal(written, mask * np.uint8(255))
+    evaluate(file, make_scene([110, 110]), output=output, overwrite=True, device="cpu")
+    assert not list((output / "test" / "masks").iterdir())
+
+
+def test_a_mask_that_leaves_nothing_is_named(file: Path) -> None:
+    with pytest.raises(SceneError, match=r"folder/1\.jpg: its mask leaves no pixel"):
+        evaluate(file, masked(make_scene([1, 2]), {1: np.zeros((24, 32), dtype=bool)}), device="cpu")
+
+
+def test_with_exposure_the_right_half_is_measured_after_a_fit_to_the_left(file: Path) -> None:
+    """The file renders 100 everywhere; the photograph is 120 on the left, 130 on the right."""
+    scene = make_scene([120])
+    image = scene.test_views[0].image.copy()
+    image[:, 16:] = 130
+    views = (replace(scene.test_views[0], pixels=image),)
+    plain = evaluate(file, replace(scene, test_views=views), device="cpu")
+    results = evaluate(file, replace(scene, test_views=views), device="cpu", exposure=True)
+    assert results.psnr == pytest.approx(20 * math.log10(255 / 10), abs=1e-6)
+    assert results.psnr > plain.psnr
+    assert plain.to_dict()["exposure"] is None
+    assert "left half" in results.to_dict()["exposure"]

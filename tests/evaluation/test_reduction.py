@@ -1,6 +1,8 @@
 """Smaller files of a made-up model: which primitives go, what is reported, what is refused."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from compgs.evaluation.camera_path import orbit, surround
 from compgs.evaluation.importance import importance, splat_importance
 from compgs.evaluation.reduction import most_important, reduce_file
 from compgs.model.hybrid_model import HybridModel
-from compgs.model.splats import SplatModel, Splats
+from compgs.model.splats import SplatArrays, SplatModel
 from compgs.render import render
 from compgs.scene.views import View
 from compgs.trained_model import TrainedModel
@@ -41,33 +43,33 @@ def data() -> bytes:
 
 
 def decoded(data: bytes) -> HybridModel:
-    return from_latents(*read_latents(data), torch.device("cpu"))
+    return from_latents(*read_latents(data))
 
 
 @pytest.fixture(scope="module")
 def cameras(data: bytes) -> list[Camera]:
-    positions = decoded(data).primitives.positions.numpy()
+    positions = decoded(data).primitives.positions
     return [camera for _, camera in orbit(positions, frames=5, width=48, height=36)]
 
 
 def test_importance_of_splats_sums_over_cameras_and_shares_the_pixels(cameras: list[Camera]) -> None:
-    chance = torch.Generator().manual_seed(0)
-    splats = Splats(
-        means=torch.randn(40, 3, generator=chance) * 0.3,
-        log_scales=torch.full((40, 3), -2.0),
-        quaternions=torch.randn(40, 4, generator=chance),
-        opacity_logits=torch.randn(40, generator=chance),
-        dc=torch.zeros(40, 3),
-        rest=torch.zeros(40, 0, 3),
-    )
+    chance = np.random.default_rng(0)
+    splats = SplatArrays(
+        means=chance.normal(0, 0.3, (40, 3)),
+        log_scales=np.full((40, 3), -2.0),
+        quaternions=chance.normal(size=(40, 4)),
+        opacity_logits=chance.normal(size=40),
+        dc=np.zeros((40, 3)),
+        rest=np.zeros((40, 0, 3)),
+    ).each(np.float32)
     model, calls = SplatModel(splats, (0.0, 0.0, 0.0)), []
     found = splat_importance(model, cameras, lambda: calls.append(None))
     covered = sum(float((1 - render(model, c).transmittance).sum()) for c in cameras)
     assert float(found.sum()) == pytest.approx(covered, rel=1e-4)
     assert len(calls) == len(cameras)
-    far = SplatModel(splats, (0.0, 0.0, 0.0), (1e5, 0.0, 0.0))
+    far = SplatModel(replace(splats, world_offset=(1e5, 0.0, 0.0)), (0.0, 0.0, 0.0))
     moved = [camera.moved((-1e5, 0.0, 0.0)) for camera in cameras]
-    torch.testing.assert_close(splat_importance(far, moved), found, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(splat_importance(far, moved), found, rtol=1e-3, atol=1e-3)
 
 
 def image(model: HybridModel, camera: Camera) -> np.ndarray:
@@ -81,19 +83,34 @@ def test_importance_sums_over_cameras_and_shares_the_pixels(data: bytes, cameras
     assert together.shape == (model.coupled,)
     assert float(together.sum()) == pytest.approx(covered, rel=1e-3)
     apart = sum(importance(model, [camera]) for camera in cameras)
-    assert torch.allclose(together, apart)
+    assert np.allclose(together, apart)
+
+
+def test_importance_is_the_same_wherever_the_scene_lies(data: bytes, cameras: list[Camera]) -> None:
+    """Cameras are the world's."""
+    model = decoded(data)
+    far = replace(model, world_offset=(1e5, -2e4, 0.0))
+    moved = [camera.moved((-1e5, 2e4, 0.0)) for camera in cameras]
+    np.testing.assert_allclose(importance(far, moved), importance(model, cameras), rtol=1e-3, atol=1e-2)
 
 
 @pytest.mark.parametrize("drop", [0.05, 0.5, 0.99])
 def test_the_least_important_share_goes(data: bytes, cameras: list[Camera], drop: float) -> None:
     model = decoded(data)
-    weights = importance(model, cameras).numpy()
+    weights = importance(model, cameras)
     kept = most_important(model, cameras, drop)
     assert (~kept).sum() == math.floor(drop * model.coupled)
     assert weights[~kept].max() <= weights[kept].min()
     result, reduction = reduce_file(data, drop=drop, cameras=cameras)
     assert reduction.after.coupled_primitives == kept.sum() == decoded(result).coupled
     assert reduction.after.bytes == len(result) < reduction.before.bytes == len(data)
+
+
+def test_of_primitives_that_contribute_alike_the_later_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = torch.tensor([1.0, 0.0, 0.0, 2.0, 0.0, 3.0])
+    monkeypatch.setattr("compgs.evaluation.reduction.importance", lambda *_: found)
+    model = SimpleNamespace(coupled=6)
+    assert most_important(model, [], 0.34).tolist() == [True, True, False, True, False, True]
 
 
 def test_dropping_what_contributes_least_loses_less_than_dropping_any(

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from compgs.errors import SplatFileError
-from compgs.formats.arrays import arrays_of, check_count, checked, degree_of, logit, normalized, sigmoid
+from compgs.formats.arrays import check_count, checked, degree_of, logit, normalized, sigmoid
+from compgs.tensors.splats import Splats
 
 PLACE = Path("a.spz")
 
@@ -16,9 +17,9 @@ PLACE = Path("a.spz")
 @pytest.mark.parametrize("degree", range(4))
 def test_splats_and_arrays_hold_the_same_numbers(made, degree: int) -> None:
     arrays = made(7, degree)
-    splats = arrays.splats()
+    splats = Splats.of(arrays)
     assert splats.degree == arrays.degree == degree
-    again = arrays_of(splats, (1.0, 2.0, 3.0))
+    again = splats.arrays((1.0, 2.0, 3.0))
     assert again.world_offset == (1.0, 2.0, 3.0)
     for name, tensor in vars(splats).items():
         assert tensor.dtype == torch.float32
@@ -27,7 +28,7 @@ def test_splats_and_arrays_hold_the_same_numbers(made, degree: int) -> None:
 
 def test_a_model_keeps_its_numbers_when_the_arrays_change(made) -> None:
     arrays = made(3)
-    splats = arrays.splats()
+    splats = Splats.of(arrays)
     arrays.means[:] = 0
     assert splats.means.abs().min() > 0
 

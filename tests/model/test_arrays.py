@@ -5,8 +5,12 @@ import pytest
 import torch
 
 from compgs.model.arrays import ALL_ROWS, MLPArrays, PrimitiveArrays
-from compgs.model.primitives import Primitives
-from compgs.model.residual_mlp import ResidualMLP
+from compgs.tensors.primitives import Primitives
+from compgs.tensors.residual_mlp import ResidualMLP
+
+
+def arrays_of(network: ResidualMLP) -> MLPArrays:
+    return MLPArrays.of({name: p.detach().numpy() for name, p in network.named_parameters()}, 6)
 
 
 def arrays_with(anchor_index: list[int], anchors: int) -> PrimitiveArrays:
@@ -42,7 +46,7 @@ def test_a_network_of_arrays_is_the_network_of_torch_in_float64(blocks):
     g = torch.Generator().manual_seed(1)
     features, residuals = torch.randn(300, 6, generator=g), torch.randn(900, 4, generator=g)
     index = torch.randint(0, 300, (900,), generator=g).sort().values
-    arrays = network.arrays()
+    arrays = arrays_of(network)
     expected = exact(features.double(), residuals.double(), index).detach().numpy()
     everything = features.numpy(), residuals.numpy()
     found = arrays.apply(*everything, index.numpy())
@@ -57,5 +61,5 @@ def test_a_network_of_arrays_is_the_network_of_torch_in_float64(blocks):
 def test_arrays_are_made_of_a_files_tensors_in_whatever_order_they_come():
     network = ResidualMLP(6, 4, 5, 16, 12)
     tensors = {name: p.detach().numpy() for name, p in sorted(network.named_parameters())}
-    for a, b in zip(MLPArrays.of(tensors, 6).whole, network.arrays().whole, strict=True):
+    for a, b in zip(MLPArrays.of(tensors, 6).whole, arrays_of(network).whole, strict=True):
         assert np.array_equal(a, b) and a.flags.c_contiguous

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from compgs.codec.content import Role
 from compgs.codec.decoder import decode
@@ -31,7 +30,7 @@ from prediction_precision import FIELDS, camera_at  # noqa: E402
 def finite(gaussians: Gaussians) -> Gaussians:
     """Without those that a renderer leaves out, since their numbers are not finite."""
     values = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
-    kept = torch.cat([v.reshape(len(gaussians), -1) for v in values.values()], 1).isfinite().all(1)
+    kept = np.isfinite(np.concatenate([v.reshape(len(gaussians), -1) for v in values.values()], 1)).all(1)
     return Gaussians(**{name: v[kept] for name, v in values.items()})
 
 
@@ -44,7 +43,7 @@ def assert_predicted(path: Path, pinned: dict[str, Any]) -> None:
     allowed = tolerances(stacked(seen))
     assert [(p.anchor, p.slot) for p in seen[:SHOWN]] == [(g["anchor"], g["slot"]) for g in pinned["first"]]
     for name, field in FIELDS.items():
-        values = getattr(found, field).double().numpy()
+        values = getattr(found, field).astype(np.float64)
         first = np.array([g[name] for g in pinned["first"]])
         assert (np.abs(values[:SHOWN] - first) <= allowed[name][:SHOWN]).all(), name
         assert (np.abs(values.sum(0) - np.array(pinned["sums"][name])) <= allowed[name].sum(0)).all(), name

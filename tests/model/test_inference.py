@@ -6,18 +6,12 @@ import pytest
 import torch
 
 from compgs.cameras import Camera
-from compgs.model import (
-    HeadDimensions,
-    HybridModel,
-    Primitives,
-    hybrid_model,
-    inference,
-    make_heads,
-    predict,
-)
-from compgs.model.prediction import Prediction, predict_geometry
-from compgs.model.primitives import select_anchors
-from compgs.model.residual_mlp_kernels import ANCHORS, ROWS
+from compgs.model import HeadDimensions, HybridModel, hybrid_model, inference
+from compgs.model.network_kernels import ANCHORS, ROWS
+from compgs.tensors.heads import make_heads
+from compgs.tensors.prediction import Prediction, predict
+from compgs.tensors.primitives import Primitives, select_anchors
+from compgs.tensors.scenes import HybridOnDevice
 
 N, D, G = 3 * ANCHORS + 17, 12, 8
 FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
@@ -42,19 +36,20 @@ def make_model(
         anchor_index=torch.repeat_interleave(counts),
         voxel_size=0.05,
     )
-    heads = make_heads(layout, HeadDimensions(D, G, 16)).requires_grad_(False)
-    return HybridModel(primitives, heads, 4.0, (0.0, 0.0, 0.0))
+    heads = make_heads(layout, HeadDimensions(D, G, 16))
+    return HybridModel(primitives.arrays(), heads.weights(), 4.0, (0.0, 0.0, 0.0))
+
+
+def wide(model: HybridModel) -> HybridOnDevice:
+    """The same in float64, by torch."""
+    names = ("primitives", "heads", "distance_unit", "background")
+    return HybridOnDevice(*(getattr(model, name) for name in names), dtype=torch.float64)
 
 
 def truth(model: HybridModel, visible: torch.Tensor, layout: str) -> Prediction:
-    p = select_anchors(model.primitives, visible)
-    names = ("positions", "log_scales", "references", "residuals")
-    wide = Primitives(
-        *(getattr(p, name).double() for name in names), anchor_index=p.anchor_index, voxel_size=p.voxel_size
-    )
-    heads = make_heads(layout, HeadDimensions(D, G, 16)).double()
-    heads.load_state_dict(model.heads.state_dict())
-    return predict(heads, wide, torch.tensor(CAMERA.center), model.distance_unit)
+    exact = wide(model)
+    seen = select_anchors(exact.primitive_tensors, visible)
+    return predict(exact.networks, seen, torch.tensor(CAMERA.center), model.distance_unit)
 
 
 def counts_with(*special: int) -> torch.Tensor:
@@ -70,15 +65,15 @@ def counts_with(*special: int) -> torch.Tensor:
 def test_gaussians_agree_with_float64_whatever_the_number_of_primitives(special, share, layout):
     model = make_model(counts_with(*special), layout=layout)
     visible = torch.rand(N, generator=torch.Generator().manual_seed(5)) < share
-    found, index = model.drawn(CAMERA, visible)
+    found, index = model.drawn(CAMERA, visible.numpy())
     expected = truth(model, visible, layout)
     # Rows of the primitives of visible anchors, in all and one after the other.
-    rows = torch.nonzero(visible[model.primitives.anchor_index]).view(-1)
-    assert torch.equal(index, rows[expected.index])
+    rows = np.flatnonzero(visible[model.primitives.anchor_index])
+    assert np.array_equal(index, rows[expected.index])
     assert len(found) > 0
     for name in FIELDS:
-        torch.testing.assert_close(
-            getattr(found, name).double(), getattr(expected.gaussians, name), atol=2e-6, rtol=1e-5
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(expected.gaussians, name), atol=2e-6, rtol=1e-5
         )
 
 
@@ -87,13 +82,9 @@ def test_gaussians_agree_with_float64_whatever_the_number_of_primitives(special,
 def test_geometry_is_the_same_in_blocks_of_any_size(monkeypatch, layout, block):
     model = make_model(counts_with(ROWS, 0, 3), layout=layout)
     monkeypatch.setattr(inference, "BLOCK", block)
-    p, heads = model.primitives, make_heads(layout, HeadDimensions(D, G, 16)).double()
-    heads.load_state_dict(model.heads.state_dict())
-    names = ("positions", "log_scales", "references", "residuals")
-    wide = Primitives(*(getattr(p, name).double() for name in names), p.anchor_index, p.voxel_size)
-    expected = predict_geometry(heads, wide, wide.residuals, wide.anchor_index)
+    expected = wide(model).geometry
     for found, exact in zip(model.geometry, expected, strict=True):
-        torch.testing.assert_close(found.double(), exact, atol=2e-6, rtol=1e-5)
+        np.testing.assert_allclose(found, exact, atol=2e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("layout", ["paired", "separate"])
@@ -104,14 +95,14 @@ def test_parts_of_a_frame_together_are_the_frame(monkeypatch, layout):
     parts = list(model.parts(CAMERA))
     assert len(parts) == 4
     for name in FIELDS:
-        assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(whole, name))
+        assert np.array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(whole, name))
 
 
 @pytest.mark.parametrize("layout", ["paired", "separate"])
 def test_an_anchor_at_the_camera_has_finite_colors(layout):
     center = torch.tensor(CAMERA.center, dtype=torch.float32)
     model = make_model(torch.full((3,), 5), positions=center.repeat(3, 1), layout=layout)
-    assert torch.isfinite(model.gaussians(CAMERA).colors).all()
+    assert np.isfinite(model.gaussians(CAMERA).colors).all()
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
@@ -124,4 +115,4 @@ def test_gaussians_do_not_depend_on_the_number_of_threads():
     finally:
         numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     for name in FIELDS:
-        assert torch.equal(getattr(one, name), getattr(two, name))
+        assert np.array_equal(getattr(one, name), getattr(two, name))

@@ -13,9 +13,11 @@ from compgs.codec.decoder import decode
 from compgs.codec.reader import read_latents
 from compgs.codec.writer import write_content
 from compgs.gaussians import Gaussians
-from compgs.model import HeadDimensions, HybridModel, Primitives, predict
+from compgs.model import HeadDimensions, HeadWeights, HybridModel, PrimitiveArrays
 from compgs.model.constants import OPACITY_CUTOFF
-from compgs.model.heads import make_heads as new_heads
+from compgs.tensors.heads import make_heads as new_heads
+from compgs.tensors.prediction import predict
+from compgs.tensors.scenes import HybridOnDevice
 
 ROOT = Path(__file__).parents[2]
 sys.path += [str(ROOT / "tools"), str(ROOT / "benchmarks")]
@@ -62,25 +64,23 @@ def made(name: str, *, own_residuals: bool, anchors: int = 60) -> Content:
 def model_of(content: Content) -> HybridModel:
     """The same in the package's own terms; names and shapes of the tensors must be those of its heads."""
     n, k = content.mask.shape
-    tensors = {name: torch.from_numpy(t).float() for name, t in content.heads.items()}
-    residuals = torch.from_numpy(content.residuals).float()
+    tensors = {name: t.astype(np.float32) for name, t in content.heads.items()}
+    residuals = content.residuals.astype(np.float32)
     if "residuals" in tensors:
-        residuals = tensors.pop("residuals")[
-            torch.arange(k).repeat(n)[torch.from_numpy(content.mask).view(-1)]
-        ]
+        residuals = tensors.pop("residuals")[np.tile(np.arange(k), n)[content.mask.ravel()]]
     network = "appearance" if content.layout == "paired" else "opacity"
     width = len(tensors[f"{network}.input_bias"])
-    heads = new_heads(content.layout, HeadDimensions(content.references.shape[1], residuals.shape[1], width))
-    heads.load_state_dict(tensors)
-    primitives = Primitives(
-        positions=torch.from_numpy(content.coordinates * content.voxel_size).float(),
-        log_scales=torch.from_numpy(content.log_scales).float(),
-        references=torch.from_numpy(content.references).float(),
+    dimensions = HeadDimensions(content.references.shape[1], residuals.shape[1], width)
+    primitives = PrimitiveArrays(
+        positions=(content.coordinates * content.voxel_size).astype(np.float32),
+        log_scales=content.log_scales.astype(np.float32),
+        references=content.references.astype(np.float32),
         residuals=residuals,
-        anchor_index=torch.from_numpy(np.argwhere(content.mask)[:, 0]),
+        anchor_index=np.argwhere(content.mask)[:, 0].copy(),
         voxel_size=content.voxel_size,
     )
-    return HybridModel(primitives, heads.requires_grad_(False), content.view_distance_scale, (0.0, 0.0, 0.0))
+    heads = HeadWeights(content.layout, dimensions, tensors)
+    return HybridModel(primitives, heads, content.view_distance_scale, (0.0, 0.0, 0.0))
 
 
 def clear_of_the_threshold(everything: list[Primitive]) -> bool:
@@ -91,7 +91,7 @@ def assert_conforms(gaussians: Gaussians, truth: Arrays) -> None:
     assert len(gaussians) == len(truth["mean"]) > 0
     allowed = tolerances(truth)
     for name, field in FIELDS.items():
-        found = getattr(gaussians, field).double().numpy()
+        found = np.asarray(getattr(gaussians, field), np.float64)
         assert found.shape == truth[name].shape
         assert (np.abs(found - truth[name]) <= allowed[name]).all(), name
 
@@ -111,7 +111,9 @@ def test_a_model_predicts_what_the_document_says(name: str, own_residuals: bool)
     assert_conforms(gaussians, truth)
     places = {(p.anchor, p.slot): i for i, p in enumerate(everything)}
     assert index.tolist() == [places[p.anchor, p.slot] for p in seen]
-    trained = predict(model.heads, model.primitives, torch.tensor(CENTER), content.view_distance_scale)
+    scene = HybridOnDevice.of(model, torch.device("cpu"))
+    p, heads = scene.primitive_tensors, scene.networks
+    trained = predict(heads, p, torch.tensor(CENTER), content.view_distance_scale)
     assert_conforms(trained.gaussians, truth)
 
 

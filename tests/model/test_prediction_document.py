@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from compgs.cameras import Camera
-from compgs.model import HeadDimensions, HybridModel, Primitives, make_heads
+from compgs.model import HeadDimensions, HybridModel, PrimitiveArrays
+from compgs.model.head_weights import HeadWeights, weight_shapes
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "docs" / "bitstream_prediction.md").read_text(encoding="utf-8")
@@ -67,8 +67,7 @@ def test_the_document_names_the_networks_of_both_layouts() -> None:
                 full = f"{network}.{name}".replace(".b.", f".{b}.")
                 found[layout][full] = tuple(sizes[side] for side in shape.split(", "))
     for layout, tensors in found.items():
-        heads = make_heads(layout, HeadDimensions(d, g, h))
-        assert tensors == {name: tuple(p.shape) for name, p in heads.named_parameters()}
+        assert tensors == weight_shapes(layout, HeadDimensions(d, g, h))
 
 
 def test_every_number_of_the_worked_example_is_right() -> None:
@@ -88,19 +87,19 @@ def test_every_number_of_the_worked_example_is_right() -> None:
 
 
 def test_the_worked_example_is_what_the_package_predicts() -> None:
-    heads = make_heads("paired", HeadDimensions(2, 1, 2)).requires_grad_(False)
-    heads.load_state_dict({k: torch.from_numpy(t).float() for k, t in TENSORS.items() if k != "residuals"})
+    tensors = {name: tensor.astype(np.float32) for name, tensor in TENSORS.items() if name != "residuals"}
+    heads = HeadWeights("paired", HeadDimensions(2, 1, 2), tensors)
 
-    def row(name: str) -> torch.Tensor:
-        return torch.from_numpy(INPUTS[name]).float()[None]
+    def row(name: str) -> np.ndarray:
+        return INPUTS[name].astype(np.float32)[None]
 
     voxel_size = float(INPUTS["voxel_size"][0])
-    anchor = Primitives(
-        positions=row("coordinates") * voxel_size,
+    anchor = PrimitiveArrays(
+        positions=row("coordinates") * np.float32(voxel_size),
         log_scales=row("s"),
         references=row("f"),
-        residuals=torch.from_numpy(TENSORS["residuals"]).float()[1:],
-        anchor_index=torch.zeros(1, dtype=torch.int64),
+        residuals=TENSORS["residuals"].astype(np.float32)[1:],
+        anchor_index=np.zeros(1, np.int64),
         voxel_size=voxel_size,
     )
     model = HybridModel(anchor, heads, float(INPUTS["view_distance_scale"][0]), (0.0, 0.0, 0.0))
@@ -109,4 +108,4 @@ def test_the_worked_example_is_what_the_package_predicts() -> None:
     found = model.gaussians(Camera(pose, 50, 50, 32, 32, 64, 64))
     for name in ("means", "scales", "quaternions", "opacities", "colors"):
         shown = STEPS[{"opacities": "opacity", "scales": "scales"}.get(name, name.removesuffix("s"))]
-        assert np.atleast_1d(getattr(found, name)[0].double()) == pytest.approx(shown, abs=2e-6)
+        assert np.atleast_1d(getattr(found, name)[0]) == pytest.approx(shown, abs=2e-6)

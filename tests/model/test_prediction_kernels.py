@@ -7,14 +7,15 @@ import torch
 
 from compgs.model import prediction_kernels as kernels
 from compgs.model.constants import OPACITY_CUTOFF
-from compgs.model.prediction import (
+from compgs.model.network_kernels import ANCHORS, ROWS
+from compgs.tensors.prediction import (
     affine_transform,
     color_activation,
     is_drawn,
     opacity_activation,
     view_embedding,
 )
-from compgs.model.residual_mlp_kernels import ANCHORS, CHUNKS, ROWS, chunk_bounds
+from compgs.tensors.residual_mlp_kernels import CHUNKS, chunk_bounds
 
 A = 30
 SIZES = [0, 1, ROWS - 1, ROWS, 3 * ROWS + 5]

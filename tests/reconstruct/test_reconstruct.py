@@ -1,7 +1,6 @@
 """From photographs to poses: compared with the poses the photographs were computed from."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +88,6 @@ def test_pinhole_images_come_out_where_they_are_asked_for(walls: Walls, tmp_path
 def test_without_pycolmap_the_remedy_is_said_before_anything_is_done(
     walls: Walls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(MissingDependency, match=r"pip install '.\[reconstruct\]'"):
         reconstruct(walls.folder, tmp_path / "scene")

@@ -1,13 +1,16 @@
 """The frustum test must not lose anything that would be drawn."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.render import RasterSettings, rasterize, visible_mask
+from compgs.render import RasterSettings, rasterize
+from compgs.render import visible_mask as visible_mask_of_arrays
+from compgs.tensors.visibility import visible_mask
 
 SETTINGS = RasterSettings()
 CUTOFF_SIGMAS = np.sqrt(2 * np.log(255))
@@ -34,7 +37,7 @@ def test_whatever_touches_a_pixel_is_visible(seed):
     scales = np.exp(r.normal(-2, 1.5, (n, 3)))
     means = r.normal(0, 1.5, (n, 3))
     fields = (means, r.normal(size=(n, 4)), scales, np.ones(n), np.ones((n, 3)))
-    drawn = rasterize(Gaussians(*(torch.tensor(f, dtype=torch.float32) for f in fields)), camera).visible
+    drawn = rasterize(Gaussians(*(f.astype(np.float32) for f in fields)), camera).visible
 
     # Anchors some way off their Gaussian, with radii that reach to where it ends
     offsets = r.normal(0, 0.3, (n, 3))
@@ -51,6 +54,8 @@ def test_the_compiled_test_is_the_plain_one():
     positions, radii = torch.tensor(r.normal(0, 3, (20_000, 3))), torch.tensor(r.uniform(0, 0.3, 20_000))
     plain = visible_mask(positions, radii, camera, SETTINGS)
     compiled = visible_mask(positions.float(), radii.float(), camera, SETTINGS)
+    arrays = positions.float().numpy(), radii.float().numpy()
+    assert np.array_equal(compiled, visible_mask_of_arrays(*arrays, camera, SETTINGS))
     assert torch.sum(plain != compiled) <= 2  # rounding, exactly on the boundary
     assert 0 < plain.sum() < len(plain)
 
@@ -60,6 +65,15 @@ def test_anchors_behind_or_far_beside_the_camera_are_not_visible():
     positions = torch.tensor([[0.0, 0, 5], [0, 0, -5], [10, 0, 5], [-10, 0, 5], [0, 10, 5], [0, -10, 5]])
     mask = visible_mask(positions, torch.full((6,), 0.1), camera, SETTINGS)
     assert mask.tolist() == [True, False, False, False, False, False]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_anchors_that_do_not_reach_the_near_plane_are_not_visible(dtype):
+    camera = Camera(np.eye(4), 50.0, 50.0, 20.0, 15.0, 40, 30)
+    positions = torch.tensor([[0, 0, 0.3], [0, 0, 0.3], [0, 0, 0.6], [0, 0, -1.0]], dtype=dtype)
+    radii = torch.tensor([0.19, 0.21, 0.0, 1.51], dtype=dtype)
+    mask = visible_mask(positions, radii, camera, RasterSettings(near_plane=0.5))
+    assert mask.tolist() == [False, True, True, True]
 
 
 def test_no_anchors_give_an_empty_mask():

@@ -232,3 +232,14 @@ def test_usual_formats_are_read(tmp_path: Path, suffix: str) -> None:
     Image.new("RGB", (24, 16), (200, 100, 50)).save(file)
     assert image_size(file) == (24, 16)
     assert np.abs(read_image(file, None)[0].mean((0, 1)) - (200, 100, 50)).max() < 4
+
+
+@pytest.mark.parametrize("name", ["a.heic", "a.jpg"])
+def test_heic_is_named_with_its_remedy(tmp_path: Path, name: str) -> None:
+    file = tmp_path / name
+    file.write_bytes(b"\x00\x00\x00\x24ftypheic" + bytes(40))
+    for reading in (image_size, lambda file: read_image(file, None)):
+        with pytest.raises(
+            UnreadableImage, match=rf"{name}: HEIC images are not read; convert all of them to JPEG"
+        ):
+            reading(file)

@@ -10,8 +10,10 @@ import pytest
 from PIL import Image
 
 from compgs.errors import CompGSError, SceneError, UnreadableImage, UnsupportedCamera
-from compgs.scene import load_scene
+from compgs.scene import images, load_scene
+from compgs.scene.nerfstudio import read_nerfstudio
 from compgs.scene.ply_points import read_ply_points
+from compgs.scene.undistort import distort
 
 WIDTH, HEIGHT = 20, 12
 
@@ -139,6 +141,30 @@ def test_nerfstudio_lenses_are_undistorted(nerfstudio: Callable[..., Path]) -> N
     assert fisheye.camera.width > WIDTH
 
 
+LENS = {"k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": -0.005, "k3": 0.04, "k4": 0.007}
+
+
+def test_nerfstudios_coefficients_are_opencvs_by_name(nerfstudio: Callable[..., Path]) -> None:
+    """Where a lens puts a point, by the equations of OpenCV's documentation with nerfstudio's names."""
+    x, y = 0.5, -0.3
+    k1, k2, p1, p2, k3, k4 = LENS.values()
+    r2 = x**2 + y**2
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2)
+    expected = (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+        y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+    )
+    lens = read_nerfstudio(nerfstudio(camera_model="OPENCV", **LENS)).images[0].distortion
+    assert lens is not None
+    np.testing.assert_allclose(distort(np.array(x), np.array(y), lens), expected, rtol=1e-12)
+    theta = np.arctan(np.sqrt(r2))
+    bent = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8) / np.sqrt(r2)
+    for model in ("OPENCV_FISHEYE", "EQUIDISTANT"):
+        fisheye = read_nerfstudio(nerfstudio(camera_model=model, **LENS)).images[0].distortion
+        assert fisheye is not None
+        np.testing.assert_allclose(distort(np.array(x), np.array(y), fisheye), (x * bent, y * bent))
+
+
 @pytest.mark.parametrize("layout", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_nerfstudio_points_are_read(nerfstudio: Callable[..., Path], layout: str) -> None:
     rng = np.random.default_rng(0)
@@ -220,3 +246,25 @@ def test_scaled_poses_keep_their_position(nerfstudio: Callable[..., Path]) -> No
         frame["transform_matrix"] = matrix.tolist()
     (folder / "transforms.json").write_text(json.dumps(content))
     assert_looks_at_origin(load_scene(folder).train_views)
+
+
+@pytest.mark.parametrize("layout", ["blender", "nerfstudio"])
+@pytest.mark.parametrize("name", ["../elsewhere.png", "/elsewhere.png", "images/../../elsewhere.png"])
+def test_images_outside_of_the_scene_are_refused_before_they_are_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str, name: str
+) -> None:
+    folder = tmp_path / "scene"
+    entries = frames(folder, "images", 3, ".png")
+    entries[1]["file_path"] = name
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "elsewhere.png")
+    file = {"blender": "transforms_train.json", "nerfstudio": "transforms.json"}[layout]
+    (folder / file).write_text(json.dumps({"camera_angle_x": 0.7, "frames": entries}))
+    opened: list[str] = []
+    monkeypatch.setattr(images, "image_size", lambda path: opened.append(str(path)) or (WIDTH, HEIGHT))
+    for module in ("blender", "nerfstudio"):
+        monkeypatch.setattr(f"compgs.scene.{module}.image_size", images.image_size)
+    with pytest.raises(
+        SceneError, match=r"scene: the image of frame 1 in .* lies outside of the scene's folder"
+    ):
+        load_scene(folder)
+    assert not [path for path in opened if "elsewhere" in path]

@@ -33,6 +33,20 @@ def test_a_run_stopped_anywhere_continues_exactly(blob_scene, tiny_config, tmp_p
         assert same(whole.model, second.model), f"stopped at step {stop}"
 
 
+def test_where_to_look_from_and_which_way_is_up_come_back(blob_scene, tiny_config, tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    model = Trainer(blob_scene, tiny_config, CPU).model
+    model.up = (0.0, 0.6, 0.8)
+    trainer = Trainer(blob_scene, tiny_config, CPU, model)
+    trainer.save(path)
+    again = load_checkpoint(path).model
+    assert again.up == (0.0, 0.6, 0.8)
+    assert len(again.viewpoints) == len(model.viewpoints) > 0
+    for mine, theirs in zip(model.viewpoints, again.viewpoints, strict=True):
+        assert (mine.world_to_camera == theirs.world_to_camera).all()
+        assert (mine.fx, mine.cy, mine.width) == (theirs.fx, theirs.cy, theirs.width)
+
+
 def test_an_interrupt_leaves_a_checkpoint_of_the_last_whole_step(blob_scene, tiny_config, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     trainer = Trainer(blob_scene, tiny_config, CPU)

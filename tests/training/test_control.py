@@ -8,12 +8,13 @@ import torch
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig, load_config
 from compgs.gaussians import Gaussians
-from compgs.model.prediction import Prediction
+from compgs.tensors.prediction import Prediction
 from compgs.trained_model import TrainedModel
 from compgs.training import target_size
 from compgs.training.control import AdaptiveControl, ControlSchedule, make_schedule, new_cells, rate_weight
 from compgs.training.initial import initial_model
 from compgs.training.optimizers import make_optimizer
+from compgs.training.rate_control import RateState
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -76,6 +77,21 @@ def test_transparent_anchors_are_removed_with_their_moments(blob_scene, tiny_con
     trainer.train_step()
 
 
+def test_new_anchors_have_no_momentum_and_the_others_keep_theirs(blob_scene, tiny_config):
+    trainer = ready(blob_scene, tiny_config)
+    control, model = trainer.control, trainer.model
+    n = model.anchors
+    before = trainer.optimizer.state[model.references]["exp_avg"].clone()
+    control.drawn[:] = 1000
+    control.gradient[:] = 1e6
+    control.act(model, trainer.optimizer, trainer.coupled_means() * 1.7, torch.Generator(), 0.004)
+    assert model.anchors > n
+    for name in model.anchor_parameters:
+        state = trainer.optimizer.state[getattr(model, name)]
+        assert not state["exp_avg"][n:].any() and not state["exp_avg_sq"][n:].any()
+    assert torch.equal(trainer.optimizer.state[model.references]["exp_avg"][:n], before)
+
+
 def test_a_scene_whose_anchors_are_all_transparent_keeps_them(blob_scene, tiny_config):
     trainer = ready(blob_scene, tiny_config)
     before = trainer.model.anchors
@@ -102,10 +118,23 @@ def test_the_schedule_scales_with_the_run(tiny_config):
 
 
 def test_statistics_follow_the_anchors(blob_scene, tiny_config):
+    """Through pruning: those that stay keep theirs, row by row."""
     model = initial_model(blob_scene, tiny_config)
-    control = AdaptiveControl(tiny_config, make_schedule(tiny_config.control, 40, 8), model.anchors, CPU)
-    assert control.gradient.shape == (model.anchors, 4)
-    assert make_optimizer(model, tiny_config.training).param_groups[0]["name"] == "log_scales"
+    n, k = model.anchors, 4
+    control = AdaptiveControl(tiny_config, make_schedule(tiny_config.control, 40, 8), n, CPU)
+    filled = {
+        "gradient": torch.arange(n * k, dtype=torch.float32).view(n, k),
+        "drawn": torch.arange(n * k, dtype=torch.float32).view(n, k) + 0.25,
+        "opacity": torch.arange(n, dtype=torch.float32) + 0.5,
+        "seen": torch.arange(n, dtype=torch.float32) + 0.75,
+    }
+    for name, values in filled.items():
+        setattr(control, name, values.clone())
+    kept = torch.rand(n, generator=torch.Generator().manual_seed(0)) < 0.6
+    control.keep(model, make_optimizer(model, tiny_config.training), kept)
+    assert model.anchors == int(kept.sum()) < n
+    for name, values in filled.items():
+        assert torch.equal(getattr(control, name), values[kept]), name
 
 
 # the schedule ------------------------------------------------------------------------------------------------------
@@ -196,6 +225,25 @@ def test_a_short_run_of_the_paper_preset_grows_and_prunes(blob_scene, tiny_confi
             lost = len(torch.unique(torch.cat([before, after]), dim=0)) - len(after)
             gone, grown = gone + lost, grown + len(after) - (len(before) - lost)
     assert grown > 0 and gone > 0
+
+
+def test_a_run_grows_by_the_lambda_that_it_has_come_to(blob_scene, tiny_config):
+    """At fifty times the usual lambda the threshold is 3.7 times as high."""
+    control = replace(tiny_config.control, growth_probabilities=(1.0, 1.0, 1.0))
+    anchors = {}
+    for lmbda in (0.002, 0.1):
+        trainer = Trainer(blob_scene, replace(tiny_config, control=control), CPU)
+        with torch.no_grad():
+            trainer.model.residuals += 5 * torch.randn(
+                trainer.model.residuals.shape, generator=torch.Generator().manual_seed(0)
+            )
+        trainer.control.drawn[:] = 1000
+        trainer.control.gradient[:] = 3 * 1000 * control.gradient_threshold
+        trainer.rate = RateState(lmbda)
+        before = trainer.model.anchors
+        trainer.grow()
+        anchors[lmbda] = trainer.model.anchors - before
+    assert anchors[0.002] > anchors[0.1] == 0
 
 
 def test_a_size_is_followed_gently_before_statistics_are_gathered(blob_scene, tiny_config, monkeypatch):

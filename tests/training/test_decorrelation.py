@@ -15,11 +15,13 @@ from compgs.training.decorrelation import (
     channel_rates,
     decorrelate,
     drop_silent_channels,
+    keep_channels,
     principal_axes,
 )
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
+MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 def trained(scene: Scene, config: Config, steps: int = 12, **entropy: object) -> Trainer:
@@ -115,6 +117,66 @@ def test_correlated_references_take_fewer_bits_in_their_axes(blob_scene: Scene, 
     assert after["covariance"] == pytest.approx(before["covariance"], rel=0.02)
 
 
+def uncorrelated(trainer: Trainer, spreads: torch.Tensor) -> None:
+    """Gives the references channels that have nothing in common, with these standard deviations [C]."""
+    references = trainer.model.references
+    chance = torch.Generator().manual_seed(2)
+    columns = torch.randn(references.shape, generator=chance, dtype=torch.float64)
+    columns = torch.linalg.qr(columns - columns.mean(0))[0] * len(references) ** 0.5
+    with torch.no_grad():
+        references.copy_(columns * spreads)
+
+
+def test_where_axes_only_change_places_moments_go_along(blob_scene: Scene, tiny_config: Config) -> None:
+    trainer = trained(blob_scene, tiny_config)
+    spreads = torch.tensor([2.0, 9.0, 1.0, 5.0, 7.0, 3.0, 8.0, 4.0])
+    uncorrelated(trainer, spreads)
+    order = spreads.argsort(descending=True)
+    before = {name: trainer.optimizer.state[trainer.model.references][name] for name in MOMENTS}
+    expected = {name: value[:, order].clone() for name, value in before.items()}
+    decorrelate(trainer.model, trainer.optimizer)
+    after = trainer.optimizer.state[trainer.model.references]
+    for name in MOMENTS:
+        assert expected[name].any()
+        largest = float(expected[name].abs().max())
+        torch.testing.assert_close(after[name].abs(), expected[name].abs(), atol=1e-3 * largest, rtol=1e-3)
+
+
+def test_scales_that_start_anew_have_no_momentum(blob_scene: Scene, tiny_config: Config) -> None:
+    trainer = trained(blob_scene, tiny_config)
+    network, c = trainer.model.entropy.reference_network, trainer.model.reference_dim
+    for parameter in (network.weights[-1], network.biases[-1]):
+        assert trainer.optimizer.state[parameter]["exp_avg"][c:].any()
+    decorrelate(trainer.model, trainer.optimizer)
+    for parameter in (network.weights[-1], network.biases[-1]):
+        moment = trainer.optimizer.state[parameter]["exp_avg"]
+        assert not moment[c:].any()
+        assert moment[:c].any()
+
+
+def test_channels_go_that_spread_over_less_than_three_tenths_of_a_step(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    trainer = trained(blob_scene, tiny_config, steps=1)
+    uncorrelated(trainer, torch.tensor([0.29, 9.0, 1.0, 0.31, 0.1, 3.0, 8.0, 4.0]))
+    left = trainer.model.references.detach()[:, [1, 2, 3, 5, 6, 7]].clone()
+    drop_silent_channels(trainer.model, trainer.optimizer)
+    assert torch.equal(trainer.model.references.detach(), left)
+
+
+def test_channels_go_at_the_last_turn_alone_and_rates_follow_at_each(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    config = replace(tiny_config, entropy=replace(tiny_config.entropy, decorrelate_at=(0.2, 0.5)))
+    for step, channels in ((8, 8), (20, 6)):
+        trainer = Trainer(blob_scene, config, CPU)
+        uncorrelated(trainer, torch.tensor([0.1, 9.0, 1.0, 0.2, 5.0, 3.0, 8.0, 4.0]))
+        trainer.step = step
+        trainer.turn_references()
+        assert trainer.model.reference_dim == channels
+        assert torch.equal(trainer.reference_rates, channel_rates(trainer.model.references))
+
+
 def test_a_step_with_momentum_does_not_care_when_the_axes_turn(
     blob_scene: Scene, tiny_config: Config
 ) -> None:
@@ -200,7 +262,26 @@ def test_a_file_of_fewer_channels_decodes_to_the_trained_latents(
     decoded = decode(tmp_path / "scene.cgs").primitives.references
     expected = trainer.model.primitives(trainer.model.quantized()).references
     assert decoded.shape == expected.shape == (trainer.model.anchors, tiny_config.model.reference_dim - 3)
-    torch.testing.assert_close(decoded.sort(0).values, expected.sort(0).values, atol=1e-3, rtol=0)
+    np.testing.assert_allclose(np.sort(decoded, 0), np.sort(expected.detach(), 0), atol=1e-3, rtol=0)
+
+
+def test_the_channels_that_stay_keep_their_means_and_scales(blob_scene: Scene, tiny_config: Config) -> None:
+    """Of the references themselves: the hyperprior's network has the means of all channels, then all scales."""
+    trainer = trained(blob_scene, tiny_config, steps=8)
+    model, network = trainer.model, trainer.model.entropy.reference_network
+    kept = torch.tensor([False, True, False, True, True, True, True, True])
+    z = torch.randn(20, tiny_config.entropy.reference_hyper_dim, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        before = network(z)
+        references = model.references.detach().clone()
+        moments = trainer.optimizer.state[network.weights[-1]]["exp_avg"].clone()
+        keep_channels(model, kept, trainer.optimizer)
+        after = network(z)
+    for old, new in zip(before, after, strict=True):
+        torch.testing.assert_close(new, old[:, kept])
+    assert torch.equal(model.references.detach(), references[:, kept])
+    rows = torch.cat([kept, kept])
+    assert torch.equal(trainer.optimizer.state[network.weights[-1]]["exp_avg"], moments[rows])
 
 
 def test_one_channel_stays_when_none_says_anything(blob_scene: Scene, tiny_config: Config) -> None:

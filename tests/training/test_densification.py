@@ -1,12 +1,14 @@
 import itertools
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from compgs.cameras import Camera
 from compgs.config import SplatConfig
-from compgs.model.splats import Splats
-from compgs.render.reference import rotation_matrices
+from compgs.tensors.reference import rotation_matrices
+from compgs.tensors.splats import Splats
 from compgs.training.densification import (
     SPLIT_SHRINK,
     DensityControl,
@@ -84,6 +86,27 @@ def test_small_splats_are_cloned_and_large_ones_split_where_the_image_pulls():
     moments = optimizer.state[parameters.dc]["exp_avg"]
     assert torch.equal(moments[:3, 0], 0.1 * torch.tensor([1.0, 3.0, 4.0]))
     assert not moments[3:].any()
+
+
+def test_a_view_adds_its_gradients_in_half_images_and_counts_what_it_draws():
+    control = DensityControl(SplatConfig(), EXTENT, 3, CPU)
+    camera = Camera(np.eye(4), 50.0, 50.0, 24.0, 18.0, 48, 36)
+    gradient = torch.tensor([[3 / 24, -4 / 18], [0.0, 0.0], [0.5 / 24, 0.0]])
+    for times in (1, 2):
+        control.observe(gradient, torch.tensor([True, False, True]), camera)
+        assert torch.allclose(control.gradient, times * torch.tensor([5.0, 0.0, 0.5]))
+        assert control.seen.tolist() == [times, 0, times]
+
+
+def test_splats_are_judged_by_their_mean_gradient_over_the_views_that_drew_them():
+    parameters = made([0.001] * 4, [0.5] * 4)
+    before = parameters.trained()
+    control = DensityControl(SplatConfig(gradient_threshold=1.0), EXTENT, 4, CPU)
+    control.gradient[:] = torch.tensor([9.0, 1.1, 0.9, 11.0])
+    control.seen[:] = torch.tensor([10.0, 1.0, 0.0, 10.0])
+    optimizer = after_one_step(parameters, SplatConfig())
+    control.act(parameters, optimizer, torch.Generator().manual_seed(0), remove_large=False)
+    assert torch.equal(parameters.dc[4:], before.dc[[1, 3]])
 
 
 def test_parts_are_spread_as_their_parent_is():

@@ -6,7 +6,7 @@ import torch
 
 from compgs.entropy.quantization import UniformNoise
 from compgs.gaussians import Gaussians
-from compgs.model.prediction import Prediction
+from compgs.tensors.prediction import Prediction
 from compgs.training.dropout import HIGHEST_OPACITY, share_left_out, thinned
 
 

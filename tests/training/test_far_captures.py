@@ -100,7 +100,7 @@ def test_importance_is_looked_at_from_cameras_of_the_world(captures, tiny_config
     found = importance(model, cameras)
     assert found.sum() > 1
     expected = importance(local, [camera.moved(model.world_offset) for camera in cameras])
-    assert torch.equal(found, expected)
+    assert np.array_equal(found, expected)
 
 
 def test_the_offset_survives_a_checkpoint_and_the_run_goes_on(blob_scene, tiny_config, tmp_path):
@@ -148,4 +148,4 @@ def test_the_offset_and_the_viewpoints_survive_the_file(blob_scene, tiny_config,
         np.testing.assert_allclose(found.rotation, camera.rotation, atol=1e-3)
     camera = scene.train_views[0].camera
     ours, theirs = (compgs.render(m, camera).image for m in (model.as_hybrid_model(), decoded))
-    assert float((ours - theirs).abs().max()) < 1e-2
+    assert np.abs(ours - theirs).max() < 1e-2

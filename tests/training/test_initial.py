@@ -7,9 +7,12 @@ import pytest
 import torch
 
 from compgs.config import Config, load_config
-from compgs.model import HeadDimensions, make_heads, predict
+from compgs.entropy.gaussian import scale_from_index
+from compgs.model import HeadDimensions
 from compgs.scene.points import colors_at
 from compgs.scene.views import Scene
+from compgs.tensors.heads import make_heads
+from compgs.tensors.prediction import predict
 from compgs.training.initial import initial_model
 
 
@@ -53,6 +56,41 @@ def test_colors_of_anchors_at_points_are_the_points_and_between_them_lie_between
     np.testing.assert_allclose(exact, points.colors / 255.0, atol=0.02)
     between = colors_at(points, np.random.default_rng(0).uniform(-1, 1, (50, 3)))
     assert between.min() >= points.colors.min() / 255.0 and between.max() <= points.colors.max() / 255.0
+
+
+def test_anchors_are_as_large_as_the_distance_to_their_three_neighbours(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    model = initial_model(blob_scene, tiny_config)
+    places = model.coordinates.double().numpy()
+    distances = np.sort(np.linalg.norm(places[:, None] - places, axis=2), axis=1)[:, 1:4]
+    expected = np.log(np.sqrt((distances**2).mean(1)))
+    np.testing.assert_allclose(model.log_scales.detach().numpy(), expected[:, None].repeat(6, 1), rtol=1e-5)
+
+
+def test_the_entropy_model_expects_the_sizes_that_anchors_start_with(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    model = initial_model(blob_scene, tiny_config)
+    with torch.no_grad():
+        mean, scale = model.entropy.covariance_network(torch.zeros(1, model.reference_dim))
+    step, sizes = model.entropy.covariance_step.detach(), model.log_scales.detach()
+    assert mean[0] * step == pytest.approx(sizes.mean().expand(6), rel=1e-4)
+    assert scale_from_index(scale[0]) * step == pytest.approx(sizes.std().expand(6), rel=1e-3)
+
+
+def test_networks_are_random_by_the_seed_and_leave_other_chance_alone(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    def first(seed: int) -> torch.Tensor:
+        training = replace(tiny_config.training, seed=seed)
+        model = initial_model(blob_scene, replace(tiny_config, training=training))
+        return torch.cat([p.detach().flatten() for p in model.heads.parameters()])
+
+    state = torch.get_rng_state()
+    assert torch.equal(first(3), first(3))
+    assert not torch.equal(first(3), first(4))
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_the_paper_preset_starts_from_references_of_zero(blob_scene: Scene) -> None:

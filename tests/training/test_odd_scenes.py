@@ -18,10 +18,11 @@ from compgs.config import Config
 from compgs.errors import ConfigError, TrainingError
 from compgs.gaussians import Gaussians
 from compgs.metrics import psnr, to_8bit
-from compgs.render import RasterSettings, rasterize, render
+from compgs.render import RasterSettings, render
 from compgs.render.render_model import Renderable
 from compgs.scene.points import fallback_points
 from compgs.scene.views import Points, Scene, View, scene_extent
+from compgs.tensors.rasterize import rasterize
 from compgs.trained_model import TrainedModel
 from compgs.training import TrainingStatus
 from compgs.training.initial import initial_model
@@ -242,9 +243,9 @@ def test_an_odd_scene_is_learned_and_its_file_shows_it(name: str, config: Config
     for view in scene.train_views[:3]:
         ours, theirs = render(model.as_hybrid_model(), view.camera), render(decoded, view.camera)
         # Sums in another order move single pixels across the rasterizer's cutoff: not all, but nearly all are the same.
-        difference = (ours.image - theirs.image).abs()
-        assert difference.square().mean() < 1e-6
-        assert difference.flatten().quantile(0.99) < 1e-3
+        difference = np.abs(ours.image - theirs.image)
+        assert np.square(difference).mean() < 1e-6
+        assert np.quantile(difference, 0.99) < 1e-3
 
 
 @pytest.mark.parametrize("name", ["portrait", "forward_facing", "differing_sizes", "one_object_on_white"])
@@ -259,7 +260,7 @@ def test_the_unit_of_length_does_not_matter(config: Config) -> None:
     near, far = (trained(each, few_steps(config)) for each in (scene, scaled(scene, 1024.0)))
     assert torch.equal(near.coordinates, far.coordinates)
     for name, value in near.named_parameters():
-        assert torch.allclose(value, far.get_parameter(name), atol=1e-4), name
+        assert torch.equal(value, far.get_parameter(name)), name
 
 
 def few_steps(config: Config) -> Config:
@@ -303,8 +304,8 @@ def test_photographs_that_show_nothing_are_no_trouble(config: Config, tmp_path: 
     decoded = decode(tmp_path / "odd.cgs")
     for view in views[:3]:
         image = render(decoded, view.camera).image
-        assert torch.isfinite(image).all()
-        assert (image - value / 255).abs().mean() < 0.1
+        assert np.isfinite(image).all()
+        assert np.abs(image - value / 255).mean() < 0.1
 
 
 @pytest.mark.parametrize("factor", [30.0, 1000.0])

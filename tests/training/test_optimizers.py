@@ -96,6 +96,20 @@ def test_anchors_out_of_view_keep_their_values_and_moments(blob_scene, tiny_conf
         assert not torch.equal(after[name], value)
 
 
+@pytest.mark.parametrize("step", [dense, sparse])
+def test_the_first_step_is_the_learning_rate_however_small_a_gradient_is(blob_scene, tiny_config, step):
+    """Gradients of single primitives are tiny: an epsilon of 1e-8 would leave these where they are."""
+    model = initial_model(blob_scene, tiny_config)
+    optimizer = make_optimizer(model, tiny_config.training)
+    before = model.references.detach().clone()
+    for name in model.anchor_parameters:
+        parameter = getattr(model, name)
+        parameter.grad = torch.full_like(parameter, 1e-9)
+    step(model, optimizer, torch.arange(model.anchors))
+    moved = before - model.references.detach()
+    torch.testing.assert_close(moved, torch.full_like(moved, 0.05), rtol=1e-3, atol=0)
+
+
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
 def test_the_same_bits_with_one_thread_and_with_two(blob_scene, tiny_config):
     views = some_views(blob_scene, tiny_config)

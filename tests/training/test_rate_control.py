@@ -8,7 +8,11 @@ import torch
 
 from compgs.codec import encode
 from compgs.errors import ConfigError
+from compgs.training.control import make_schedule
+from compgs.training.file_size import latent_bytes
+from compgs.training.initial import initial_model
 from compgs.training.rate_control import HIGHEST, LOWEST, RateState, due, follow
+from compgs.training.target_size import TargetSize
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -36,6 +40,57 @@ def test_the_size_is_reached_however_strongly_it_answers_to_lambda(
     target: float, settling: float, g: float
 ) -> None:
     assert made_up_run(target, g, settling)[0] == pytest.approx(target, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("before", "ratio", "progress", "grown", "change"),
+    [
+        (None, 1.1, 0.6, True, 2 * math.log(1.1)),
+        (None, 1.1, 0.96, True, math.log(1.1)),  # on the way from 0.92 to the end: half
+        (0.02, 1.01, 0.6, True, 2 * math.log(1.01) + 15 * (math.log(1.01) - 0.02)),
+        (0.02, 1.01, 1.0, True, 15 * (math.log(1.01) - 0.02)),
+        (None, 1.5, 0.3, False, 0.2 * (math.log(1.5) - 0.1)),
+        (None, 1.05, 0.3, False, 0.2 * (math.log(1.05) - 0.1)),  # it will shrink by itself
+        (None, 9.0, 0.6, True, math.log(1.6)),
+        (None, 1 / 9, 0.6, True, -math.log(1.6)),
+    ],
+)
+def test_lambda_moves_by_the_formula(
+    before: float | None, ratio: float, progress: float, grown: bool, change: float
+) -> None:
+    state = RateState(0.01, before, 0.7)
+    after = follow(state, ratio * 5000, 5000, progress=progress, grown=grown)
+    assert math.log(after.lmbda / 0.01) == pytest.approx(change)
+    assert after.share == 0.7
+    assert after.error == (pytest.approx(math.log(ratio)) if grown else before)
+
+
+def test_the_share_that_is_left_is_that_of_all_prunings_to_come(blob_scene, tiny_config):
+    """Two prunings of a tenth leave 0.9^2 of the blending weights, and the file then has no idle primitives."""
+    control = replace(tiny_config.control, prune_share=0.1, idle_share=0.05)
+    model = initial_model(blob_scene, replace(tiny_config, control=control))
+    chance = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        model.references += 3 * torch.randn(model.references.shape, generator=chance)
+    weights = torch.rand(model.anchors, 4, generator=chance, dtype=torch.float64) ** 3
+    size = TargetSize(
+        model, make_schedule(control, 40, 8), frozenset({10, 20}), contributions=lambda: weights
+    )
+    for step, left in ((5, 0.81), (10, 0.81), (11, 0.9), (21, 1.0)):
+        found = size.lasting_share(0.002, step)
+        assert model.mask.all(), "the model is as it was"
+        order = weights.sum(1).argsort(descending=True)
+        needed = int((weights.sum(1)[order].cumsum(0) < left * weights.sum()).sum()) + 1
+        kept = torch.zeros(model.anchors, dtype=torch.bool)
+        kept[order[:needed]] = True
+        flat = weights.view(-1).sort(descending=True)
+        idle = flat.values[int((flat.values.cumsum(0) < 0.95 * weights.sum()).sum())]
+        before = latent_bytes(model)
+        model.mask = kept[:, None] & (weights >= idle)
+        expected = latent_bytes(model) / before
+        model.mask = torch.ones_like(model.mask)
+        assert found == pytest.approx(expected, rel=0.005), step
+        assert found < left
 
 
 @pytest.mark.parametrize(("target", "limit"), [(1e3, HIGHEST), (1e7, LOWEST)])

@@ -56,6 +56,20 @@ def test_a_scene_that_is_too_small_is_to_be_scaled_up(blob_scene: Scene, tiny_co
     check_points_seen(scaled(blob_scene, 1e-3 * 1000), NEAR)
 
 
+@pytest.mark.parametrize(("near", "far"), [(45, 55), (55, 45)])
+def test_half_of_what_is_seen_may_be_too_near_to_be_drawn(blob_scene: Scene, near: int, far: int) -> None:
+    camera = blob_scene.train_views[0].camera
+    ahead = camera.center + 2.0 * camera.rotation[2]
+    close = camera.center + 0.5 * NEAR * camera.rotation[2]
+    scene = with_points(blob_scene, np.concatenate([np.tile(close, (near, 1)), np.tile(ahead, (far, 1))]))
+    scene = replace(scene, train_views=scene.train_views[:1])
+    if near < far:
+        check_points_seen(scene, NEAR)
+    else:
+        with pytest.raises(TrainingError, match="55 % of what"):
+            check_points_seen(scene, NEAR)
+
+
 @pytest.mark.parametrize("kind", [Trainer, SplatTrainer])
 def test_points_behind_all_cameras_stop_a_run(blob_scene: Scene, tiny_config, kind) -> None:
     behind = blob_scene.points.positions + np.array([0.0, 0.0, 500.0])

@@ -6,12 +6,15 @@ import torch
 
 from compgs.config import Config, SplatConfig, TrainingConfig
 from compgs.errors import CheckpointError, ConfigError, TrainingError
-from compgs.formats import arrays_of, encoded
+from compgs.formats import encoded
 from compgs.gaussians import Gaussians
 from compgs.metrics import psnr, to_8bit
-from compgs.model.splats import SplatModel, Splats
-from compgs.render import RasterSettings, rasterize, render
+from compgs.model.splats import SplatModel
+from compgs.render import RasterSettings, render
 from compgs.scene.views import Points
+from compgs.tensors.rasterize import rasterize
+from compgs.tensors.splats import Splats
+from compgs.tensors.ssim import ssim
 from compgs.training import SplatTrainer, Trainer, train_splats
 from compgs.training.checkpoint import load_checkpoint
 from compgs.training.densification import DensifySchedule
@@ -34,11 +37,11 @@ SCHEDULE = DensifySchedule(start=8, stop=45, every=10, reset_every=15)
 
 
 def ply_bytes(splats: Splats) -> bytes:
-    return encoded(arrays_of(splats), "ply")
+    return encoded(splats.arrays(), "ply")
 
 
 def file_of(model) -> bytes:
-    return ply_bytes(model.splats)
+    return encoded(model.splats, "ply")
 
 
 def test_the_same_seed_gives_the_same_file_and_another_seed_another(blob_scene, config):
@@ -105,7 +108,7 @@ def test_training_shows_the_held_out_view_and_a_late_reset_does_not_spoil_it(blo
     (view,) = blob_scene.test_views
     flat = np.broadcast_to(view.image.mean((0, 1)).round().astype(np.uint8), view.image.shape)
     trainer.run(None, None)
-    model = SplatModel(trainer.parameters.trained(), blob_scene.background)
+    model = SplatModel(trainer.parameters.trained().arrays(), blob_scene.background)
     assert psnr(to_8bit(render(model, view.camera).image), view.image) > 8 + psnr(flat, view.image)
 
 
@@ -129,6 +132,54 @@ def test_all_parameters_are_trained(blob_scene, config):
     trainer.train_step()
     after = trainer.parameters.trained()
     assert [name for name in vars(before) if torch.equal(getattr(before, name), getattr(after, name))] == []
+
+
+def test_each_parameter_moves_by_its_own_rate_and_positions_by_the_extent(blob_scene):
+    config = Config(
+        training=TrainingConfig(steps=100),
+        splats=SplatConfig(
+            position_lr=(1e-3, 1e-5), color_lr=2e-3, harmonics_lr=3e-3, opacity_lr=4e-3, log_scale_lr=5e-3,
+            rotation_lr=6e-3,
+        ),
+    )  # fmt: skip
+    trainer = SplatTrainer(replace(blob_scene, extent=7.0), config, CPU)
+    trainer.step = 50
+    before = trainer.parameters.trained()
+    trainer.train_step()
+    after = trainer.parameters.trained()
+    # The first step of Adam is as long as the rate, whatever the gradient.
+    rates = {"means": 7e-4, "dc": 2e-3, "rest": 3e-3, "opacity_logits": 4e-3, "log_scales": 5e-3}
+    for name, rate in (rates | {"quaternions": 6e-3}).items():
+        moved = (getattr(after, name) - getattr(before, name)).abs()
+        assert float(moved.max()) == pytest.approx(rate, rel=0.01), name
+
+
+def test_a_run_resets_opacities_and_removes_what_is_large_only_afterwards(blob_scene):
+    """Splats as large as the scene, in a run that acts after steps 2, 4 and 6 and resets after 3."""
+    for remove in (False, True):
+        config = Config(training=TrainingConfig(steps=100), splats=SplatConfig(gradient_threshold=1e3))
+        trainer = SplatTrainer(blob_scene, config, CPU)
+        trainer.schedule = DensifySchedule(start=2, stop=50, every=2, reset_every=3 if remove else 40)
+        with torch.no_grad():
+            trainer.parameters.log_scales[:5] = np.log(0.2 * blob_scene.extent)
+            trainer.parameters.opacity_logits[:] = 3.0
+        sizes, opacities = [], []
+        for _ in range(4):
+            trainer.train_step()
+            sizes.append(float(trainer.parameters.log_scales.detach().amax().exp()) / blob_scene.extent)
+            opacities.append(float(trainer.parameters.opacity_logits.detach().max().sigmoid()))
+        assert min(sizes[:3]) > 0.1
+        assert (sizes[3] < 0.1) == remove
+        assert (opacities[2] < 0.011) == remove and opacities[1] > 0.9
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_the_loss_of_a_step_is_its_formula(blob_scene, weight):
+    trainer = SplatTrainer(blob_scene, Config(training=TrainingConfig(steps=100, ssim_weight=weight)), CPU)
+    result = trainer.train_step()
+    image, photograph = result.image.double(), torch.from_numpy(result.view.image.copy()).double() / 255
+    expected = (1 - weight) * (image - photograph).abs().mean() + weight * (1 - ssim(image, photograph))
+    assert float(result.loss) == pytest.approx(float(expected), rel=1e-4)
 
 
 def test_points_become_round_splats_of_their_color_as_large_as_their_distance():

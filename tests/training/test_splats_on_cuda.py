@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from compgs.config import Config, TrainingConfig
-from compgs.model.spherical_harmonics import view_colors
+from compgs.tensors.spherical_harmonics import view_colors
 from compgs.training import SplatTrainer
 
 pytestmark = [

@@ -1,4 +1,4 @@
-"""What the tests of web/ need that is not Python: Node with the packages of web/, and a Chromium. Skipped without."""
+"""What the tests of web/ need that is not Python: Node with the packages of web/. Skipped without."""
 
 import os
 import shutil
@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 WEB = Path(__file__).parents[2] / "web"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 MAX_SECONDS = 600
 
 
@@ -28,14 +27,6 @@ def built(node: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("web")
     run([node, "build.mjs", str(folder)])
     return folder
-
-
-@pytest.fixture(scope="session")
-def browser() -> str:
-    for name in BROWSERS:
-        if path := shutil.which(name):
-            return path
-    pytest.skip("no Chromium is on PATH")
 
 
 def run(command: list[str], **environment: str) -> str:

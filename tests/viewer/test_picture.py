@@ -71,7 +71,7 @@ def test_the_page_shows_what_the_renderer_does(name: str, browser: str, tmp_path
     assert error == ": " and len(pictures) == len(cameras)
     for picture, camera in zip(pictures, cameras, strict=True):
         image = compgs.render(model, camera).image
-        expected = (image.clamp(0, 1) * 255).round().numpy()
+        expected = np.rint(np.clip(image, 0, 1) * 255)
         assert expected.std() > 10  # something is there to see
         assert psnr(picture, expected) >= LEAST_DB
 

@@ -1,6 +1,7 @@
 """What all commands have in common."""
 
 import dataclasses
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,6 +11,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from compgs.cli.run_folder import SceneSource
 from compgs.cli.usage import UsageError, check_range, settings_of_options
 from compgs.errors import ConfigError
+from compgs.extras import require
 
 NO_DEFAULT = ""  # instead of "(default: None)" in the help
 
@@ -42,6 +44,29 @@ class ComputingCommand(Command):
             use_threads(self.threads)
         if self.device is not None:
             check_device(self.device)
+
+    def prepare_training(self) -> None:
+        """`prepare`, for what trained models need. Raises MissingDependency without torch, too."""
+        require("train", "training")
+        self.prepare()
+        if self.threads is not None:
+            import torch
+
+            torch.set_num_threads(self.threads)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecodingCommand(ComputingCommand):
+    """A command that decodes a file."""
+
+    tmc3: FlagCreatePairsOff[bool] = False
+    """Let the program tmc3 from PATH decode anchor positions that a file has by G-PCC."""
+
+    def prepare(self) -> None:
+        """Apply `threads` and `tmc3`, check `device`. Raises UsageError, ConfigError."""
+        super().prepare()
+        if self.tmc3:
+            allow_tmc3()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,14 +164,19 @@ def one_scene(scene: Path | None, source: Path | None) -> Path:
 
 
 def use_threads(count: int) -> None:
-    """Of numba and torch. Raises UsageError."""
+    """Of numba. Raises UsageError."""
     import numba
-    import torch
 
     limit = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     check_range("--threads", count, 1, limit)
     numba.set_num_threads(count)
-    torch.set_num_threads(count)
+
+
+def allow_tmc3() -> None:
+    """From now on, in this process."""
+    from compgs.codec.tmc3 import ASKED_BY
+
+    os.environ[ASKED_BY] = "1"
 
 
 def check_lpips() -> None:
@@ -157,17 +187,11 @@ def check_lpips() -> None:
 
 
 def check_device(name: str) -> None:
-    """Raises UsageError for a device that PyTorch does not know or does not find."""
-    import torch
+    """Raises ConfigError for a device that is not known or not there, UsageError for what is no device."""
+    from compgs import devices
 
     try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise UsageError(f"--device {name}: expected cpu or cuda") from error
-    if device.type not in ("cpu", "cuda"):
-        raise UsageError(f"--device {name}: expected cpu or cuda")
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise ConfigError(
-            f"--device {name}: PyTorch finds {torch.cuda.device_count()} CUDA devices; "
-            "use --device cpu, or install a CUDA build of PyTorch"
-        )
+        devices.check_device(name)
+    except ConfigError as error:
+        kind = type(error) if name.startswith("cuda") else UsageError
+        raise kind(f"--{error}") from error

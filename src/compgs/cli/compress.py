@@ -61,8 +61,8 @@ class Compress(ComputingCommand):
     """Size of the file: 130kB, 2MB, 1.5MiB or plain bytes."""
 
     time: Annotated[str | None, arg(metavar="TIME", help_behavior_hint=NO_DEFAULT)] = None
-    """How long it may take, about: 5min, 90s, 1h30min. The steps are chosen for it before the training begins; how
-    fast the machine is decides, so that --seed alone no longer gives the same file."""
+    """How long it may take until the file is written, about: 5min, 90s, 1h30min. The steps are chosen for it before the
+    training begins; as the machine's speed decides, --seed alone no longer gives the same file."""
 
     steps: Annotated[
         int | None, arg(aliases=["--iterations"], metavar="N", help_behavior_hint="(default: the preset's)")

@@ -13,6 +13,7 @@ from compgs.cli.usage import in_words_of_options
 
 if TYPE_CHECKING:
     from compgs.codec.reader import RangeInfo
+    from compgs.evaluation.comparison import Comparison
     from compgs.evaluation.reduction import Reduction
     from compgs.evaluation.results import Results
 
@@ -125,6 +126,8 @@ def print_results(results: "Results") -> None:
         warn(in_words_of_options(note))
     say(f"{results.file} on {results.scene}: {views}, {results.device}, {results.threads} threads")
     console.print(table)
+    if results.exposure is not None:
+        say(results.exposure)
     console.print()
     counts = {
         "bits/anchor": results.anchors,
@@ -154,3 +157,32 @@ def print_reduction(reduction: "Reduction") -> None:
         table.add_row("PSNR, held-out photographs", *shown)
     console.print(table)
     say(f"new renderings against old ones, {reduction.cameras} cameras: PSNR {reduction.psnr:.2f} dB")
+
+
+def print_comparison(found: "Comparison") -> None:
+    """Two files beside each other."""
+    a, b = found.a, found.b
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for heading in (a.file, b.file, "change"):
+        table.add_column(escape(heading), justify="right")
+    for name, old, new in (
+        ("bytes", a.bytes, b.bytes),
+        ("primitives", a.primitives, b.primitives),
+        ("anchors", a.anchors, b.anchors),
+    ):
+        if old is None and new is None:
+            continue
+        change = f"{100 * (new / old - 1):+.1f} %" if old and new is not None else ""
+        table.add_row(name, *("" if count is None else f"{count:,}" for count in (old, new)), change)
+    if a.psnr is not None and b.psnr is not None and a.ssim is not None and b.ssim is not None:
+        change = f"{b.psnr - a.psnr:+.2f} dB"
+        table.add_row("PSNR, photographs", f"{a.psnr:.2f} dB", f"{b.psnr:.2f} dB", change)
+        table.add_row("SSIM, photographs", f"{a.ssim:.4f}", f"{b.ssim:.4f}", f"{b.ssim - a.ssim:+.4f}")
+    table.add_row("decoding", duration(a.decode_seconds), duration(b.decode_seconds))
+    table.add_row("rendering a view", duration(a.render_seconds), duration(b.render_seconds))
+    console.print(table)
+    for line in found.in_words():
+        say(line)
+    for note in found.notes:
+        say(f"note: {note}")

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, FileArgument
+from compgs.cli.command import NO_DEFAULT, DecodingCommand, FileArgument
 from compgs.cli.console import duration, say, size
 from compgs.cli.inputs import check_bitstream
 from compgs.cli.prefixes import parse_prefix
@@ -16,7 +16,7 @@ from compgs.outputs import check_output_folder, write_bytes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Decode(ComputingCommand, FileArgument):
+class Decode(DecodingCommand, FileArgument):
     """Decode a .cgs file and write what it holds as NumPy arrays.
 
     latents.npz: positions [N, 3], log_scales [N, 6] and references [N, C] of the anchors; residuals [P, C]
@@ -67,12 +67,11 @@ class Decode(ComputingCommand, FileArgument):
         if self.output is None:
             return
         import numpy as np
-        import torch
 
-        offset = torch.tensor(model.world_offset, dtype=torch.float64)
+        offset = np.array(model.world_offset, dtype=np.float64)
         p = model.primitives
         means, scales, quaternions = model.geometry
-        contents = {
+        contents: dict[str, dict[str, Any]] = {
             "latents.npz": {
                 "positions": p.positions,
                 "log_scales": p.log_scales,
@@ -88,9 +87,8 @@ class Decode(ComputingCommand, FileArgument):
                 "world_offset": offset,
             },
         }
-        for name, tensors in contents.items():
+        for name, arrays in contents.items():
             buffer = io.BytesIO()
-            arrays: dict[str, Any] = {key: value.cpu().numpy() for key, value in tensors.items()}
             np.savez(buffer, **arrays)
             write_bytes(self.output / name, buffer.getvalue())
             say(f"{self.output / name}: {size(buffer.tell())}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from compgs.cli.command import ComputingCommand, ReadingOptions
+from compgs.cli.command import DecodingCommand, ReadingOptions, allow_tmc3
 from compgs.cli.console import duration, print_components, print_reduction, say, size
 from compgs.cli.inputs import check_bitstream, read_bitstream
 from compgs.cli.progress import counting
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Encode(ComputingCommand, ReadingOptions):
+class Encode(DecodingCommand, ReadingOptions):
     """Write the .cgs file of a run that has been trained, or a smaller file from a .cgs file, without training.
 
     Smaller: --drop leaves out the coupled primitives that contribute least to images, --coarser rounds the anchors'
@@ -76,7 +76,10 @@ class Encode(ComputingCommand, ReadingOptions):
 
     def run(self) -> None:
         path = self.check()
-        self.prepare()
+        if self.source.is_dir():
+            self.prepare_training()
+        else:
+            self.prepare()
         start = time.perf_counter()
         data = self.encoded_run() if self.source.is_dir() else read_bitstream(self.source)
         if self.reduces:
@@ -101,6 +104,7 @@ class Encode(ComputingCommand, ReadingOptions):
             from compgs.codec.tmc3 import find_program
 
             find_program()
+            allow_tmc3()  # what is written is read again
         if self.reduces:
             from compgs.evaluation.reduction import check_reduction
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileOrRunArgument, SceneOptions, check_lpips
+from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileOrRunArgument, SceneOptions, check_lpips
 from compgs.cli.console import print_results, say, warn
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import file_and_run, read_otherwise
@@ -15,7 +15,7 @@ from compgs.outputs import check_output_folder
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(ComputingCommand, SceneOptions, SceneFileOrRunArgument):
+class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
     """Decode a file, render a scene's held-out views from it and compare them with the photographs.
 
     Give -r, --images, --test-every and --background as in training: the views held out there are the ones to
@@ -43,6 +43,10 @@ class Evaluate(ComputingCommand, SceneOptions, SceneFileOrRunArgument):
     lpips: FlagCreatePairsOff[bool] = False
     """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
 
+    exposure: FlagCreatePairsOff[bool] = False
+    """Give each rendering the exposure of its photograph, fitted to the left half, and measure the right half; as for
+    runs that were trained with --set training.exposure=true."""
+
     def run(self) -> None:
         from compgs.formats import check_scene
 
@@ -68,6 +72,8 @@ class Evaluate(ComputingCommand, SceneOptions, SceneFileOrRunArgument):
                 overwrite=self.overwrite,
                 lpips=self.lpips,
                 device=self.device,
+                method=run.method if run else None,
+                exposure=self.exposure or (run is not None and run.config.training.exposure),
                 progress=progress,
             )
         say("")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileArgument
+from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileArgument
 from compgs.cli.console import say, size
 from compgs.cli.progress import counting
 from compgs.cli.sizes import parse_size
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(ComputingCommand, SceneFileArgument):
+class Export(DecodingCommand, SceneFileArgument):
     """Write a scene as plain splats (.ply, .spz, .sog, .glb), or as a web page that shows it (.html).
 
     In a .cgs file opacity and color depend on where one stands; other programs know harmonics. They are fitted

@@ -12,7 +12,9 @@ from rich.table import Table
 
 from compgs import __version__
 from compgs.cli.arguments import command_name, parse_command
+from compgs.cli.benchmark import Benchmark
 from compgs.cli.command import Command
+from compgs.cli.compare import Compare
 from compgs.cli.compiling import say_when_compiling
 from compgs.cli.compress import Compress
 from compgs.cli.console import console, errors, show_whatever_can_be_shown
@@ -24,9 +26,11 @@ from compgs.cli.export import Export
 from compgs.cli.info import Info
 from compgs.cli.reconstruct import Reconstruct
 from compgs.cli.render import Render
+from compgs.cli.report import Report
 from compgs.cli.serve import Serve
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError, in_words_of_options
+from compgs.cli.view import View
 from compgs.errors import CompGSError
 from compgs.interrupt import Terminated, ended_on_request, held_back
 
@@ -38,6 +42,10 @@ COMMANDS: tuple[type[Command], ...] = (
     Decode,
     Render,
     Evaluate,
+    View,
+    Compare,
+    Report,
+    Benchmark,
     Export,
     Serve,
     Info,

@@ -113,7 +113,7 @@ def show(result: "Reconstruction") -> None:
     if result.missing:
         names = ", ".join(result.missing[:MOST_NAMES]) + (", ..." if len(result.missing) > MOST_NAMES else "")
         say(f"note: without a pose: {names}")
-    if result.models > 1:
+    if result.missing and result.models > 1:
         say(f"note: {result.models} parts could not be joined; the largest is the scene")
     say(f"{result.scene / 'reconstruction.png'} shows cameras and points; next: compgs train {result.scene}")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from compgs import __version__
-from compgs.cli.methods import METHODS
 from compgs.config import Config, config_from_dict
 from compgs.errors import CheckpointError, OutputError
+from compgs.methods import METHODS
 from compgs.outputs import write_json
 
 SETTINGS_NAME = "config.json"
@@ -39,6 +39,7 @@ class RunSettings:
     scene: SceneSource
     config: Config
     method: str = "compgs"
+    splats: str | None = None  # file of splats that the run began with
 
 
 def file_name(folder: Path, extension: str = ".cgs") -> str:
@@ -54,6 +55,7 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
         "preset": settings.preset,
         "scene": asdict(settings.scene),
         "settings": settings.config.to_dict(),
+        **({"from_splats": settings.splats} if settings.splats is not None else {}),
     }
     write_json(folder / SETTINGS_NAME, content)
 
@@ -117,7 +119,8 @@ def forget_results(folder: Path) -> None:
 def _made_by_runs(folder: Path) -> list[Path]:
     """The checkpoint, and what is made of it in the end."""
     names = [CHECKPOINT_NAME, TRAINING_NAME, "results.json", "per_view.json"]
-    return [folder / name for name in names + [file_name(folder, m.extension) for m in METHODS.values()]]
+    suffixes = sorted({method.suffix for method in METHODS.values()})
+    return [folder / name for name in names + [file_name(folder, suffix) for suffix in suffixes]]
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -134,11 +137,13 @@ def load_settings(folder: Path) -> RunSettings:
     path = folder / SETTINGS_NAME
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+        method = _known_method(content.get("method", "compgs"))
         return RunSettings(
             preset=str(content["preset"]),
             scene=_scene_source(content["scene"]),
-            config=config_from_dict(content["settings"], str(path)),
-            method=_known_method(content.get("method", "compgs")),
+            config=config_from_dict(content["settings"], str(path), METHODS[method].settings),
+            method=method,
+            splats=content.get("from_splats"),
         )
     except FileNotFoundError as error:
         if (folder / CHECKPOINT_NAME).is_file():
@@ -180,7 +185,7 @@ def file_and_run(path: Path) -> tuple[Path, RunSettings | None]:
 
 
 def _written_by(folder: Path, settings: RunSettings) -> Path:
-    return folder / file_name(folder, METHODS[settings.method].extension)
+    return folder / file_name(folder, METHODS[settings.method].suffix)
 
 
 def read_otherwise(begun: SceneSource, now: SceneSource) -> str:

@@ -5,14 +5,15 @@ import typing
 from collections.abc import Iterable
 from typing import Any
 
-from compgs.cli.usage import UsageError, settings_of_options
+from compgs.cli.usage import OPTIONS, UsageError, settings_of_options
 from compgs.config import Config, config_from_dict
+from compgs.methods import Method
 
 
 def with_settings(config: Config, assignments: Iterable[str]) -> Config:
     """The config with `section.key=value` assignments applied, checked. Raises UsageError."""
     values = config.to_dict()
-    kinds = typing.get_type_hints(Config)
+    kinds = typing.get_type_hints(type(config))
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         section, dot, key = name.strip().partition(".")
@@ -32,7 +33,20 @@ def with_settings(config: Config, assignments: Iterable[str]) -> Config:
         except ValueError as error:
             raise UsageError(f"--set {assignment}: {error}") from error
     with settings_of_options():
-        return config_from_dict(values, "--set")
+        return config_from_dict(values, "--set", type(config))
+
+
+def check_settings_of(method: Method, assignments: Iterable[str]) -> None:
+    """Raises UsageError for a `section.key=value` assignment of a setting that the method does not use."""
+    sections = typing.get_type_hints(method.settings)
+    for assignment in assignments:
+        name = assignment.partition("=")[0].strip()
+        section = name.partition(".")[0]
+        if section in sections and section not in method.uses and name not in method.uses:
+            ours = ", ".join(f"{each}.*" if "." not in each else each for each in method.uses)
+            raise UsageError(
+                f"{OPTIONS.get(name, f'--set {name}')}: not a setting of --method {method.name}, which has {ours}"
+            )
 
 
 def parse_value(kind: Any, text: str) -> Any:

@@ -3,15 +3,16 @@
 import json
 import shlex
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
 from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, check_lpips, one_scene
 from compgs.cli.console import duration, print_profile, print_results, say, size
-from compgs.cli.methods import METHODS, check_settings_of
 from compgs.cli.offer import with_poses
 from compgs.cli.progress import counting, training
 from compgs.cli.run_folder import (
@@ -25,14 +26,17 @@ from compgs.cli.run_folder import (
     load_settings,
 )
 from compgs.cli.scenes import read_scene
-from compgs.cli.settings import with_settings
+from compgs.cli.settings import check_settings_of, with_settings
 from compgs.cli.sizes import parse_cameras, parse_size
 from compgs.cli.usage import UsageError, settings_of_options
-from compgs.config import load_config
+from compgs.cli.viewing import check_viewing, viewing
 from compgs.errors import MissingSparseModel
+from compgs.extras import require
+from compgs.methods import METHODS, Method, settings_of, train
 from compgs.outputs import check_output_folder, write_json
 
 if TYPE_CHECKING:
+    from compgs.cli.viewing import Viewing
     from compgs.scene import Scene
     from compgs.training import TrainingStatus
 
@@ -47,8 +51,8 @@ NOTABLE_MISS = 0.05  # of the size that was asked for
 class Train(ComputingCommand, SceneOptions):
     """Train a scene, write its file, decode the file and compare it with the held-out views.
 
-    The file is a .cgs. With --method 3dgs the scene is trained by plain 3D Gaussian Splatting instead, without any
-    compression, and the file is a .ply: what compression is to be compared with.
+    The file is a .cgs. With --method the scene is trained by another method, and the file is that method's: of 3dgs,
+    plain 3D Gaussian Splatting without any compression, a .ply: what compression is to be compared with.
 
     The run's folder then holds the file, results.json, per_view.json, config.json, the renders beside the
     photographs (test/renders, test/gt, contact_sheet.png) and a checkpoint.
@@ -67,6 +71,8 @@ class Train(ComputingCommand, SceneOptions):
 
     compgs train scenes/garden -o runs/garden-3dgs --method 3dgs
 
+    compgs train scenes/garden -o runs/garden --viewer
+
     compgs train -o runs/garden --resume
     """
 
@@ -79,11 +85,21 @@ class Train(ComputingCommand, SceneOptions):
     eval: bool = True
     """Hold views out and evaluate on them; --no-eval trains on every view."""
 
-    method: Annotated[Literal["compgs", "3dgs"] | None, arg(help_behavior_hint="(default: compgs)")] = None
-    """compgs: hybrid primitives, rate and distortion. 3dgs: plain 3D Gaussian Splatting."""
+    method: Annotated[
+        str | None,
+        arg(
+            metavar="NAME",
+            help="; ".join(f"{name}: {each.description}" for name, each in METHODS.items()),
+            help_behavior_hint="(default: compgs)",
+        ),
+    ] = None
+
+    from_splats: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=NO_DEFAULT)] = None
+    """Splats that were trained already, as another run's .ply, in place of the plain 3DGS that a method begins
+    with."""
 
     preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: default)")] = None
-    """Settings to start from: default, paper (as published) or quick (minutes on two cores)."""
+    """Settings to start from: default, paper (as published) or quick (minutes on two cores); some methods have more."""
 
     lmbda: Annotated[float | None, arg(metavar="LAMBDA", help_behavior_hint="(default: the preset's)")] = None
     """Weight of the rate: larger means a smaller file."""
@@ -105,7 +121,8 @@ class Train(ComputingCommand, SceneOptions):
     from. About 13 bytes each."""
 
     set: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="SECTION.KEY=VALUE")] = ()
-    """Any other setting of the run; sections: model, entropy, control, training; of 3dgs: splats, training."""
+    """Any other setting of the run; sections: model, entropy, control, training; of plain 3DGS and what builds on it:
+    splats, training, and one of the method's own."""
 
     resume: FlagCreatePairsOff[bool] = False
     """Continue the run in RUN from its last checkpoint, with the settings it began with."""
@@ -119,6 +136,16 @@ class Train(ComputingCommand, SceneOptions):
     lpips: FlagCreatePairsOff[bool] = False
     """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
 
+    viewer: FlagCreatePairsOff[bool] = False
+    """Show the scene as it grows, in the browser, for less than a tenth of the training's speed; what comes out is the
+    same (needs `pip install '.[view]'` in the project's folder)."""
+
+    viewer_host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address at which the viewer listens; 0.0.0.0 is all addresses of this machine."""
+
+    viewer_port: Annotated[int, arg(metavar="N")] = 8080
+    """Port at which it listens; 0 takes a free one."""
+
     def run(self) -> None:
         if self.output is None:
             raise UsageError(
@@ -126,24 +153,41 @@ class Train(ComputingCommand, SceneOptions):
             )
         if self.resume and self.overwrite:
             raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
+        require("train", "training")
         folder = self.output
         check_output_folder(folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES)
         settings = self.settings(folder)
-        self.prepare()
+        self.prepare_training()
         if self.lpips:
             check_lpips()
+        if self.viewer:
+            check_viewing(self.viewer_port, "--viewer-port")
         if self.resume:
             say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
         scene, settings = self.read(settings)
-        with beginning(folder, settings, anew=not self.resume) as earlier:
-            model = self.train(scene, settings, folder, earlier)
-        path = folder / file_name(folder, METHODS[settings.method].extension)
+        with (
+            self.viewing(scene, folder.name) as viewing,
+            beginning(folder, settings, anew=not self.resume) as earlier,
+        ):
+            model = self.train(scene, settings, folder, earlier, viewing)
+        method = METHODS[settings.method]
+        path = folder / file_name(folder, method.suffix)
         start = time.perf_counter()
-        written = METHODS[settings.method].write(model, path)
+        written = method.write(model, path, settings.config)
         say(f"{path}: {size(written)}, written in {duration(time.perf_counter() - start)}")
-        self.evaluate(scene, path, folder)
+        self.evaluate(scene, path, folder, settings)
         if settings.config.training.target_bytes is not None:
             say_miss(folder, settings.config.training.target_bytes)
+
+    @contextmanager
+    def viewing(self, scene: "Scene", title: str) -> "Iterator[Viewing | None]":
+        """Where the training is looked at, if it is to be. Raises UsageError."""
+        if not self.viewer:
+            yield None
+            return
+        with viewing(scene, title, self.viewer_host, self.viewer_port) as view:
+            say(f"the scene as it grows: {view.address}")
+            yield view
 
     def read(self, settings: RunSettings) -> tuple["Scene", RunSettings]:
         """The scene; where there are photographs without poses, of those that are found if the user agrees."""
@@ -164,17 +208,25 @@ class Train(ComputingCommand, SceneOptions):
         if not self.resume:
             preset, method = self.preset or "default", self.method or "compgs"
             source = self.scene_source(holdout=self.eval)
-            check_settings_of(method, self.assignments())
+            if method not in METHODS:
+                raise UsageError(f"--method {method}: expected one of {', '.join(METHODS)}")
+            self.check_splats(METHODS[method])
+            check_settings_of(METHODS[method], self.assignments())
             with settings_of_options():
-                start = load_config(preset)
+                start = settings_of(method, preset)
             config = with_settings(start, self.assignments())
-            return RunSettings(preset, source, config, method)
+            splats = None if self.from_splats is None else str(self.from_splats)
+            return RunSettings(preset, source, config, method, splats)
         begun = load_settings(folder)
         if self.scene or self.source:
             # The data may have moved; whether it is the same scene, the checkpoint knows.
             begun = replace(begun, scene=replace(begun.scene, path=str(one_scene(self.scene, self.source))))
         if self.method not in (None, begun.method):
             raise UsageError(f"--method {self.method}: the run to continue began with {begun.method}")
+        if self.from_splats is not None and str(self.from_splats) != begun.splats:
+            raise UsageError(
+                f"--from-splats {self.from_splats}: the run to continue began with {begun.splats}"
+            )
         if self.preset not in (None, begun.preset):
             raise UsageError(f"--preset {self.preset}: the run to continue began with preset {begun.preset}")
         self.check_same_reading(begun.scene)
@@ -184,6 +236,16 @@ class Train(ComputingCommand, SceneOptions):
                 "--resume continues with the settings the run began with; other ones need a new run"
             )
         return begun
+
+    def check_splats(self, method: Method) -> None:
+        """Raises UsageError, SplatFileError for splats that the method has no use for, or that are none."""
+        if self.from_splats is None:
+            return
+        from compgs.formats import check_scene
+
+        if not method.from_splats:
+            raise UsageError(f"--from-splats: --method {method.name} does not begin with plain 3DGS")
+        check_scene(self.from_splats)
 
     def check_same_reading(self, begun: SceneSource) -> None:
         """Raises UsageError for an option by which the scene would be read otherwise than when the run began."""
@@ -206,10 +268,18 @@ class Train(ComputingCommand, SceneOptions):
         }
         return (*(f"{name}={value}" for name, value in named.items() if value is not None), *self.set)
 
-    def train(self, scene: "Scene", settings: RunSettings, folder: Path, earlier: EarlierRun | None) -> Any:
+    def train(
+        self,
+        scene: "Scene",
+        settings: RunSettings,
+        folder: Path,
+        earlier: EarlierRun | None,
+        viewing: "Viewing | None",
+    ) -> Any:
         """The method's model. Raises KeyboardInterrupt, with what to do next, when the user stops it."""
-        from compgs.training import StepProfile
+        from compgs.training import History, StepProfile
 
+        history = History()
         profile = StepProfile() if self.profile else None
         last: TrainingStatus | None = None
         continues = self.continues(folder)
@@ -220,18 +290,24 @@ class Train(ComputingCommand, SceneOptions):
                 def on_progress(status: "TrainingStatus") -> None:
                     nonlocal last
                     last = status
+                    history.add(status)
                     if earlier is not None:
                         earlier.look()
                     show(status)
+                    if viewing is not None:
+                        viewing.tell(status)
 
-                model = METHODS[settings.method].train(
+                model = train(
                     scene,
                     settings.config,
+                    method=settings.method,
+                    splats=settings.splats,
                     output=folder,
                     resume=continues,
                     on_progress=on_progress,
                     device=self.device,
                     profile=profile,
+                    watch=viewing,
                 )
         except KeyboardInterrupt as stop:
             if earlier is not None:
@@ -242,6 +318,7 @@ class Train(ComputingCommand, SceneOptions):
             write_json(
                 folder / TRAINING_NAME,
                 {
+                    "method": settings.method,
                     "steps": last.steps,
                     last.kind: last.primitives,
                     "estimated_bytes": last.estimated_bytes,
@@ -250,6 +327,7 @@ class Train(ComputingCommand, SceneOptions):
                     "seconds_per_step": last.seconds_per_step,
                     "resumed": continues,
                     **({"milliseconds_per_step": profile.milliseconds()} if profile else {}),
+                    "curve": history.curve(),
                 },
             )
         say(f"trained in {duration(seconds)}")
@@ -257,7 +335,7 @@ class Train(ComputingCommand, SceneOptions):
             print_profile(profile.milliseconds())
         return model
 
-    def evaluate(self, scene: "Scene", file: Path, folder: Path) -> None:
+    def evaluate(self, scene: "Scene", file: Path, folder: Path, settings: RunSettings) -> None:
         if not scene.test_views:
             say("no views are held out (--no-eval): the file was not evaluated")
             return
@@ -272,6 +350,8 @@ class Train(ComputingCommand, SceneOptions):
                 lpips=self.lpips,
                 device=self.device,
                 progress=progress,
+                method=settings.method,
+                exposure=settings.config.training.exposure,
             )
         say("")
         print_results(results)

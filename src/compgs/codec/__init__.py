@@ -1,6 +1,6 @@
 """How bits become bytes: integers, exact on every machine (docs/bitstream.md).
 
-`encode` and `decode` are resolved on first use: the entropy coder, the tables and the octree need no torch.
+`encode` and `decode` are resolved on first use: only the encoder of trained models needs torch.
 """
 
 from typing import TYPE_CHECKING
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 def __getattr__(name: str) -> object:
     if name == "encode":
+        from compgs.extras import require
+
+        require("train", "compgs.encode")
         from compgs.codec.encoder import encode
 
         return encode

@@ -4,8 +4,12 @@
 
 `tmc3` is MPEG's reference encoder; it is packaged nowhere and is found on PATH. It is here for fidelity to
 the paper: octree.py takes fewer bytes, and needs no other program.
+
+A file may come from anyone, and must not decide which programs run here: to decode, `tmc3` is run only by those who
+asked for it, with the environment variable COMPGS_TMC3=1 or `--tmc3`.
 """
 
+import os
 import shutil
 import subprocess
 import tempfile
@@ -18,9 +22,10 @@ from compgs.codec.anchor_order import canonical_order
 from compgs.codec.octree import MAXIMUM_ANCHORS
 from compgs.errors import CorruptSection, MissingDependency, NotEncodable
 
-__all__ = ["PROGRAM", "decode_positions_tmc3", "encode_positions_tmc3", "find_program"]
+__all__ = ["ASKED_BY", "PROGRAM", "decode_positions_tmc3", "encode_positions_tmc3", "find_program"]
 
 PROGRAM = "tmc3"
+ASKED_BY = "COMPGS_TMC3"  # environment variable; 1: files may have their positions decoded by the program
 TIME_LIMIT = 600  # seconds; TMC13 takes about two per million anchors
 
 # Lossless octree without planar mode, isolated points coded directly; the authors' choice.
@@ -78,10 +83,16 @@ def encode_positions_tmc3(coordinates: NDArray[np.int32]) -> bytes:
 def decode_positions_tmc3(data: bytes, count: int) -> NDArray[np.int32]:
     """Payload of `count` anchors -> [N, 3] voxel coordinates, in canonical order (anchor_order.py).
 
-    TMC13 returns its points in an order of its own. Raises MissingDependency without `tmc3`, CorruptSection
-    if what it decodes is not `count` distinct voxels. How `tmc3` behaves on damaged data is beyond this
-    package: it runs in a process of its own, with a time limit.
+    TMC13 returns its points in an order of its own. Raises MissingDependency without `tmc3`, or where nobody asked for
+    it, CorruptSection if what it decodes is not `count` distinct voxels. How `tmc3` behaves on damaged data is beyond
+    this package: it runs in a process of its own, with a time limit.
     """
+    if os.environ.get(ASKED_BY) != "1":
+        raise MissingDependency(
+            f"anchor positions: they are coded by G-PCC, and the program {PROGRAM}, which decodes them, is run only "
+            f"when that is asked for: give --tmc3, or set {ASKED_BY}=1; else ask for the file with positions of the "
+            "octree coder"
+        )
     program = find_program()
     if len(data) <= 12 or not 1 <= count <= MAXIMUM_ANCHORS:
         raise CorruptSection(f"anchor positions: {len(data)} bytes of G-PCC for {count} anchors")
@@ -121,7 +132,9 @@ def decode_positions_tmc3(data: bytes, count: int) -> NDArray[np.int32]:
 def find_program() -> str:
     """Path of `tmc3`. Raises MissingDependency."""
     program = shutil.which(PROGRAM)
-    if program is None:
+    # Windows looks into the current folder first, whatever PATH says, and what lies there may have come with a scene.
+    folders = [os.path.abspath(folder) for folder in os.environ.get("PATH", "").split(os.pathsep) if folder]
+    if program is None or os.path.dirname(os.path.abspath(program)) not in folders:
         raise MissingDependency(
             f"geometry by G-PCC: no program {PROGRAM!r} on PATH; build github.com/MPEGGroup/mpeg-pcc-tmc13 "
             "and put it there, or use the octree coder, which is the default"

@@ -259,16 +259,19 @@ def _cheapest(values: np.ndarray) -> tuple[int, int]:
         high, counts = np.unique(_split(values, low_bits)[0], return_counts=True)
         near = round(SCALES_PER_OCTAVE * (spread - low_bits - SMALLEST_SCALE_OCTAVE))
         near = min(max(near, 0), GAUSSIAN_COUNT - 1)
-        for table in range(max(0, near - 24), min(GAUSSIAN_COUNT, near + 13)):
-            j = high - int(tables.lowest[table])
-            beyond = np.where(j < 0, -2 * j - 1, 2 * (j - int(tables.counts[table])))
-            escaped = (j < 0) | (j >= tables.counts[table])
-            cost = costs[tables.offsets[table] + np.where(escaped, tables.counts[table], j)]
-            varint_bytes = 1 + sum((beyond >= (1 << 7 * n)).astype(np.int64) for n in range(1, 5))
-            cost = cost + np.where(escaped, varint_bytes * 8 * 65536, 0)
-            total = int((cost * counts).sum()) + low_bits * len(values) * 65536
-            if best[0] < 0 or total < best[0]:
-                best = (total, table, low_bits)
+        nearby = np.arange(max(0, near - 24), min(GAUSSIAN_COUNT, near + 13))
+        # A row for each table: a loop over them in Python would take longer than all else in writing a small file.
+        symbols = tables.counts[nearby].astype(np.int64)[:, None]
+        j = high - tables.lowest[nearby].astype(np.int64)[:, None]
+        beyond = np.where(j < 0, -2 * j - 1, 2 * (j - symbols))
+        escaped = (j < 0) | (j >= symbols)
+        cost = costs[tables.offsets[nearby].astype(np.int64)[:, None] + np.where(escaped, symbols, j)]
+        varint_bytes = 1 + sum((beyond >= (1 << 7 * n)).astype(np.int64) for n in range(1, 5))
+        cost += np.where(escaped, varint_bytes * 8 * 65536, 0)
+        totals = (cost * counts).sum(1) + low_bits * len(values) * 65536
+        least = int(np.argmin(totals))  # the first of equal ones
+        if best[0] < 0 or totals[least] < best[0]:
+            best = (int(totals[least]), int(nearby[least]), low_bits)
     return best[1], best[2]
 
 

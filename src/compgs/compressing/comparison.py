@@ -7,8 +7,9 @@ from pathlib import Path
 from statistics import fmean
 
 from compgs import metrics
-from compgs.formats import arrays_of, encoded, open_scene
-from compgs.model.splats import SplatModel
+from compgs.devices import CPU
+from compgs.formats import encoded, open_scene
+from compgs.model.splats import ORIGIN, SplatModel
 from compgs.render import Renderable, render
 from compgs.scene.views import View
 
@@ -26,16 +27,19 @@ class Compared:
 
 
 def compare(
-    model: SplatModel, views: Sequence[View], formats: Sequence[str] = COMPARED
+    model: SplatModel, views: Sequence[View], formats: Sequence[str] = COMPARED, *, device: str = CPU
 ) -> tuple[Compared, ...]:
     """By the same measure as a file of ours: 8-bit pictures against those of the splats."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for name in formats:
-            data = encoded(arrays_of(model.splats, model.world_offset), name)
+            data = encoded(model.at(ORIGIN).splats, name)
             file = Path(folder, f"same.{name}")
             file.write_bytes(data)
-            again = open_scene(file, model.splats.means.device, model.background)
+            again = open_scene(file, device, model.background)
+            assert isinstance(again, SplatModel)
+            # Neither format says where positions count from.
+            again = again.at(model.world_offset)
             rows.append(Compared(name, len(data), *quality(again, views)))
     return tuple(rows)
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from compgs.codec import encode
 from compgs.compressing import run
@@ -25,19 +24,21 @@ from compgs.compressing.start import seen_weights, start_points
 from compgs.compressing.surroundings import Lens
 from compgs.compressing.teacher import teacher_scene
 from compgs.config import Config, check_config, load_config
+from compgs.devices import chosen_device
 from compgs.errors import CheckpointError, ConfigError, NotACompGSFile, OutputError
 from compgs.evaluation import evaluate
 from compgs.evaluation.results import Results
-from compgs.formats import format_of, open_scene
+from compgs.formats import component_bytes, format_of, open_scene
+from compgs.methods import train
 from compgs.model.splats import SplatModel
 from compgs.outputs import check_output_file, check_output_folder, write_json
 from compgs.scene.views import Scene
-from compgs.training import TrainingStatus, train
+from compgs.training import TrainingStatus
 from compgs.training.checkpoint import CHECKPOINT_NAME
 
 SPLATS_PER_ANCHOR = 4.0  # at the start; growth adds anchors, pruning removes them
 HELD_OUT_EVERY = 8  # of given cameras, by name: as scenes are split (`load_scene`)
-FOR_THE_REST = 0.1  # of a given time: to write the file and to judge it
+FOR_THE_REST = 0.1  # of a given time: the last look at all views, and writing the file
 NEEDED_BYTES = 64 << 20  # checkpoint, file and pictures of a small scene
 STEPS = 8000  # unless a preset or a time is asked for: minutes on two cores
 
@@ -86,8 +87,8 @@ def compress(
     """Write splats (.ply, .spz, .splat, .sog, .glb) as a .cgs file, by training on renderings of them.
 
     Settings are those of `config`, or of a preset; of neither, those of `default` with STEPS steps. With `seconds` the
-    number of steps is chosen, before the training, so that all of it takes about that long. `looking` says from where
-    the splats are looked at: places are found where there is something to see, unless cameras are named.
+    number of steps is chosen, before the training, so that the file is there after about that long. `looking` says from
+    where the splats are looked at: places are found where there is something to see, unless cameras are named.
 
     Beside the file, in `folder_of(output)`, are a checkpoint, from which `resume` goes on with the settings it began
     with, `results.json`, `per_view.json`, `cameras.json`, pictures and `contact_sheet.png`.
@@ -153,13 +154,13 @@ class Compression:
         )
         compressed = Compressed(
             source=self.begun.source,
-            source_bytes=self.begun.source.stat().st_size,
+            source_bytes=sum(component_bytes(self.begun.source).values()),
             splats=len(self.splats.splats),
             file=self.file,
             folder=folder,
             steps=self.begun.config.training.steps,
             results=results,
-            others=compare(self.splats, self.scene.test_views),
+            others=compare(self.splats, self.scene.test_views, device=self.device),
         )
         write_json(folder / "results.json", compressed.to_dict())
         return compressed
@@ -234,11 +235,6 @@ def opened(source: Path, looking: Looking, device: str | None) -> SplatModel:
     model = open_scene(source, chosen_device(device), looking.background)
     assert isinstance(model, SplatModel), type(model)
     return model
-
-
-def chosen_device(device: str | None) -> str:
-    """The given one, else CUDA where there is one."""
-    return device or ("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def digest(source: Path) -> str:

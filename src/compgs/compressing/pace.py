@@ -4,8 +4,9 @@ import time
 from dataclasses import replace
 
 from compgs.config import Config
+from compgs.methods import train
 from compgs.scene.views import Scene
-from compgs.training import TrainingStatus, train
+from compgs.training import TrainingStatus
 
 TRIED = 40  # steps; the pace is that of the later ones
 TRIED_VIEWS = 12

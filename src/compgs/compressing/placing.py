@@ -18,12 +18,12 @@ from compgs.model.splats import SplatModel
 from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
 
 UP = (0.0, -1.0, 0.0)  # as COLMAP's worlds usually come out, and most files of splats with them
-CANDIDATES = 2.0  # for each camera that is wanted
+CANDIDATES = 3.0  # for each camera that is wanted
 TRIES = 12  # places for each candidate; in the open at least one of them is expected to be
 SAMPLED = 20_000  # splats by which cameras are chosen
 WELL_SEEN = 0.1  # of the largest weight that a splat has in any candidate's picture
 # Sine of the angle above the horizon from which on a camera looks up: at a ceiling, or at a ground from below. Few do.
-LOOKING_UP, RARELY = 0.17, 0.2
+LOOKING_UP, RARELY = 0.17, 0.35
 NEIGHBOURS = 4  # of a camera: the nearest ones, between which others are held out
 BETWEEN = (0.25, 0.75)  # of the way from a camera to its neighbour
 SHAKE = 0.1  # of the way: how far aside, about

@@ -8,12 +8,12 @@ something: no depth has to be rendered.
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from compgs.cameras import Camera
+from compgs.formats.arrays import normalized
 from compgs.gaussians import Gaussians
 from compgs.model.splats import SplatModel
-from compgs.render import RasterSettings, contributions, local_camera, visible_mask
+from compgs.render import RasterSettings, blend_of, contributions, local_camera, visible_mask
 
 PROBE_SIDE = 80  # pixels, the longer side of a probing picture
 INSIDE = 3.0  # standard deviations from a splat's middle: whoever is nearer stands in it
@@ -49,20 +49,18 @@ def probe(model: SplatModel, camera: Camera) -> Probe:
     settings = RasterSettings(background=model.background)
     visible = visible_mask(*model.bounds, small, settings)
     gaussians = model.gaussians(small, visible)
-    weights = contributions(gaussians, small, settings)
+    weights = contributions(gaussians, small, settings, blend_of(model))
     within = weights[standing_in(gaussians, small.center)].sum()
     shares = float(weights.sum()) / (width * height), float(within) / (width * height)
-    return Probe(torch.nonzero(visible).view(-1).cpu().numpy(), weights.cpu().numpy(), *shares)
+    return Probe(np.flatnonzero(visible), weights, *shares)
 
 
-def standing_in(gaussians: Gaussians, place: np.ndarray) -> torch.Tensor:
+def standing_in(gaussians: Gaussians[np.ndarray], place: np.ndarray) -> np.ndarray:
     """[M] bool: which Gaussians a place [3] is in, within INSIDE standard deviations along each of their axes."""
-    offsets = (
-        torch.as_tensor(place, dtype=gaussians.means.dtype, device=gaussians.means.device) - gaussians.means
-    )
-    w, *xyz = (gaussians.quaternions / gaussians.quaternions.norm(dim=1, keepdim=True)).unbind(1)
+    offsets = place - gaussians.means.astype(np.float64)
+    quaternions = normalized(gaussians.quaternions)
+    w, axis = quaternions[:, :1], quaternions[:, 1:]
     # Into the Gaussian's axes, by the conjugate quaternion: v + 2 w (v x q) + 2 (v x q) x q.
-    axis = torch.stack(xyz, 1)
-    across = torch.linalg.cross(offsets, axis)
-    turned = offsets + 2 * w[:, None] * across + 2 * torch.linalg.cross(across, axis)
-    return ((turned / gaussians.scales) ** 2).sum(1) < INSIDE**2
+    across = np.cross(offsets, axis)
+    turned = offsets + 2 * w * across + 2 * np.cross(across, axis)
+    return ((turned / gaussians.scales) ** 2).sum(axis=1) < INSIDE**2

@@ -27,13 +27,13 @@ class Shape:
 def shape_of(model: SplatModel) -> Shape:
     """Quantiles by weight: neither few far splats nor many that are hardly there move them."""
     splats = model.splats
-    means = splats.means.cpu().numpy().astype(np.float64)
+    means = splats.means.astype(np.float64)
     weights = splat_weights(model)
     middle = np.array([weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
     distances = np.linalg.norm(means - middle, axis=1)
     radius, reach = (weighted_quantile(distances, weights, share) for share in (RADIUS_SHARE, REACH_SHARE))
     # All in one place: as large as a splat is.
-    least = float(splats.log_scales.exp().amax())
+    least = float(np.exp(splats.log_scales.max()))
     return Shape(
         means, weights, middle, radius or least, reach or least, distances <= reach, np.cumsum(weights)
     )
@@ -41,10 +41,10 @@ def shape_of(model: SplatModel) -> Shape:
 
 def splat_weights(model: SplatModel) -> np.ndarray:
     """[M] float64, sum 1: opacity x area, the area of its two longer axes, at most LARGEST_AREA medians."""
-    scales = np.sort(model.splats.log_scales.exp().cpu().numpy().astype(np.float64), axis=1)
+    scales = np.sort(np.exp(model.splats.log_scales.astype(np.float64)), axis=1)
     areas = scales[:, 2] * scales[:, 1]
     areas = np.minimum(areas, LARGEST_AREA * np.median(areas))
-    weights = areas * model.splats.opacity_logits.sigmoid().cpu().numpy()
+    weights = areas * model.splats.opacities
     total = weights.sum()
     return weights / total if total > 0 else np.full(len(weights), 1 / len(weights))
 

@@ -36,8 +36,8 @@ def start_points(
     kept = np.ones(len(weights), dtype=bool)
     kept[ascending[idle]] = False
     offset = np.asarray(model.world_offset)
-    means = model.splats.means.cpu().numpy().astype(np.float64)[kept]
-    colors = np.clip(COLOR_OFFSET + Y0 * model.splats.dc.cpu().numpy()[kept], 0.0, 1.0)
+    means = model.splats.means.astype(np.float64)[kept]
+    colors = np.clip(COLOR_OFFSET + Y0 * model.splats.dc[kept], 0.0, 1.0)
     size = voxel_size or voxel_size_for(means, anchors)
     _, cell = np.unique(np.round(means / size).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.reshape(-1)

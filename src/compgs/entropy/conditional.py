@@ -18,7 +18,7 @@ from compgs.entropy.gaussian import BLOCK, FASTMATH, SCALE_LEVELS, element_bits,
 from compgs.entropy.network import FRACTION_BITS, EntropyNetwork, round_fixed
 from compgs.entropy.quantization import quantize, round_straight_through
 from compgs.numerics.compiled import njit
-from compgs.numerics.linear import transposed_product
+from compgs.tensors.linear import transposed_product
 
 Noise = Callable[[Tensor], Tensor]
 

@@ -18,7 +18,7 @@ from compgs.entropy.conditional import code_latents
 from compgs.entropy.factorized import FactorizedDensity
 from compgs.entropy.network import EntropyNetwork, leaky
 from compgs.entropy.quantization import round_straight_through
-from compgs.numerics.linear import Reader, linear
+from compgs.tensors.linear import Reader, linear
 
 STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from compgs.entropy.quantization import quantize_weight, round_straight_through
-from compgs.numerics.linear import Reader, linear
+from compgs.tensors.linear import Reader, linear
 
 # A power of two, so that the decoder's leaky ReLU is a shift.
 NEGATIVE_SLOPE = 2.0**-6

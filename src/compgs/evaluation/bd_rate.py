@@ -8,9 +8,9 @@ the mean difference over the qualities that both reach is turned back into a rat
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from compgs.errors import ConfigError
+from compgs.extras import require
 
 Curve = Sequence[tuple[float, float]]  # (bytes, quality), one pair per encoded file, in any order
 
@@ -20,8 +20,11 @@ def bd_rate(reference: Curve, test: Curve) -> float:
 
     Quality is a number that is larger for better images (PSNR in dB, SSIM). Raises ConfigError for curves of
     fewer than two points, curves on which more bytes do not mean more quality, and curves that share no
-    quality.
+    quality; MissingDependency without scipy.
     """
+    require("train", "BD-rate")
+    from scipy.interpolate import PchipInterpolator
+
     reference_quality, reference_log_bytes = _sorted_curve(reference, "reference")
     test_quality, test_log_bytes = _sorted_curve(test, "test")
     low = max(reference_quality[0], test_quality[0])

@@ -74,16 +74,23 @@ def camera_from_entry(entry: Any, place: str) -> tuple[str, Camera]:
 def read_cameras(path: Path) -> list[tuple[str, Camera]]:
     """Names and cameras of a camera file. Raises SceneError."""
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
+        content = path.read_bytes()
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise SceneError(f"{path}: not a camera file: {error}") from error
+    return parse_cameras(content, str(path))
+
+
+def parse_cameras(content: bytes, place: str) -> list[tuple[str, Camera]]:
+    """Names and cameras of a camera file's content. Raises SceneError with `place` in front."""
+    try:
+        entries = json.loads(content.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{place}: not a camera file: {error}") from error
     if not isinstance(entries, list) or not entries:
         raise SceneError(
-            f"{path}: expected a list of cameras, found {type(entries).__name__ if entries else 'none'}"
+            f"{place}: expected a list of cameras, found {type(entries).__name__ if entries else 'none'}"
         )
-    return [camera_from_entry(entry, f"{path}: camera {i}") for i, entry in enumerate(entries)]
+    return [camera_from_entry(entry, f"{place}: camera {i}") for i, entry in enumerate(entries)]
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

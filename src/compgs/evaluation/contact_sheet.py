@@ -9,6 +9,7 @@ CELL_WIDTH = 480  # pixels, at most; wider images are reduced
 COLUMN_WIDTH = 300  # pixels, at least: a label must fit
 MARGIN = 8  # pixels
 TEXT = 16  # pixels, height of a label
+STRIPE = 6  # pixels, width of a stripe over what does not count
 INK, PAPER = (30, 30, 30), (255, 255, 255)
 
 
@@ -40,6 +41,15 @@ def contact_sheet(
         sheet.paste(right, (column + 2 * MARGIN, top))
         top += left.height
     return np.asarray(sheet)
+
+
+def striped(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """[H, W, 3] uint8 with stripes over what does not count by a mask [H, W], which keeps half of its color."""
+    if mask is None:
+        return image
+    row, column = np.indices(mask.shape)
+    stripes = np.where((row + column) // STRIPE % 2, 127, 0).astype(np.uint8)
+    return np.where(mask[:, :, None], image, image // 2 + stripes[:, :, None])
 
 
 def _drawable(text: str) -> str:

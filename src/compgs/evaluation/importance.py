@@ -2,29 +2,28 @@
 
 from collections.abc import Callable, Sequence
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from compgs.cameras import Camera
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
-from compgs.render import RasterSettings, contributions, local_camera, visible_mask
+from compgs.render import RasterSettings, blend_of, contributions, local_camera, visible_mask
 
 
 def importance(
     model: HybridModel, cameras: Sequence[Camera], progress: Callable[[int, int], None] | None = None
-) -> Tensor:  # [P] float64, pixels
+) -> np.ndarray:  # [P] float64, pixels
     """Blending weights (transmittance x alpha) of each coupled primitive, summed over pixels and cameras.
 
     `progress(done, total)` is called after each camera.
     """
     settings = RasterSettings(background=model.background)
-    total = torch.zeros(model.coupled, dtype=torch.float64, device=model.primitives.positions.device)
+    total = np.zeros(model.coupled)
     for i, world_camera in enumerate(cameras):
         camera = local_camera(model, world_camera)
         gaussians, drawn = model.drawn(camera, visible_mask(*model.bounds, camera, settings))
         # No atomics: `drawn` names each primitive once, so the sum is the same in every run.
-        total[drawn] += contributions(gaussians, camera, settings).double()
+        total[drawn] += contributions(gaussians, camera, settings, blend_of(model))
         if progress:
             progress(i + 1, len(cameras))
     return total
@@ -32,13 +31,13 @@ def importance(
 
 def splat_importance(
     model: SplatModel, cameras: Sequence[Camera], progress: Callable[[], None] | None = None
-) -> Tensor:  # [M] float32, pixels
+) -> np.ndarray:  # [M] float32, pixels
     """The same of splats; `progress()` is called after each camera."""
     settings = RasterSettings(background=model.background)
-    total = torch.zeros_like(model.splats.opacity_logits)
+    total = np.zeros(len(model.splats), np.float32)
     for world_camera in cameras:
         camera = local_camera(model, world_camera)
-        total += contributions(model.gaussians(camera), camera, settings)
+        total += contributions(model.gaussians(camera), camera, settings, blend_of(model))
         if progress:
             progress()
     return total

@@ -4,17 +4,19 @@ import hashlib
 import io
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
-import torch
 from PIL import Image
 
 from compgs import __version__, metrics
 from compgs.cameras import Camera
+from compgs.devices import chosen_device, device_name
 from compgs.errors import SceneError
 from compgs.evaluation.camera_path import camera_entry
-from compgs.evaluation.contact_sheet import contact_sheet
+from compgs.evaluation.contact_sheet import contact_sheet, striped
+from compgs.evaluation.exposure import DESCRIPTION, exposed_by_left_half, right_half
 from compgs.evaluation.fit import misfits
 from compgs.evaluation.results import Results, ViewResult
 from compgs.formats import component_bytes, open_scene
@@ -23,6 +25,9 @@ from compgs.outputs import check_output_folder, write_bytes, write_json
 from compgs.render import Renderable, render
 from compgs.scene import as_scene
 from compgs.scene.views import Scene, View
+
+if TYPE_CHECKING:
+    from compgs.devices import Device
 
 SHEET_ROWS = 4  # views on the contact sheet
 
@@ -34,20 +39,28 @@ def evaluate(
     output: str | Path | None = None,
     overwrite: bool = False,
     lpips: bool = False,
-    device: str | torch.device | None = None,
+    device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
+    method: str | None = None,
+    exposure: bool = False,
     truth: str = "photograph",
 ) -> Results:
     """Open a file of any known format (`compgs.formats`) and compare its renderings with a scene's held-out views.
 
     Metrics are of 8-bit images (`compgs.metrics`). A scene that is given as a folder is read as `load_scene(folder)`
     does. With `output`, a folder, `results.json` and `per_view.json` (their schema: `compgs.evaluation.results`),
-    `cameras.json` (of the held-out views), `test/renders`, `test/gt` and `contact_sheet.png` are written there.
-    `progress(done, total)` is called after each view. Where the file tells that it was made from another scene, or from
-    views or sizes of images other than these, `notes` of the results say so. `truth`: what the views' images are, as
-    the contact sheet calls them.
+    `cameras.json` (of the held-out views), `test/renders`, `test/gt`, `test/masks` (of views that have one: white where
+    a pixel counts) and `contact_sheet.png` are written there.
+    `progress(done, total)` is called after each view; `method` is noted: which one wrote the file. Where the file tells
+    that it was made from another scene, or from views or sizes of images other than these, `notes` of the results say
+    so. `truth`: what the views' images are, as the contact sheet calls them.
 
-    Raises BitstreamError, SplatFileError, SceneError if the scene holds no view out, OutputError.
+    Pixels that a view's mask leaves out do not count. With `exposure`, for scenes that were trained with exposures of
+    their views, each rendering gets that of its view first, fitted to the left half, and the right half is measured
+    (`compgs.evaluation.exposure`).
+
+    Raises BitstreamError, SplatFileError, OutputError, and SceneError if the scene holds no view out or a mask leaves
+    nothing.
     """
     path, scene = Path(file), as_scene(scene)
     if output is not None:
@@ -56,9 +69,9 @@ def evaluate(
         raise SceneError(
             f"{scene.name}: no view is held out, so there is nothing to evaluate on; load with hold-out"
         )
-    chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    model, first_seconds = _timed_decode(path, chosen, scene.background)
-    model, decode_seconds = _timed_decode(path, chosen, scene.background)
+    chosen = chosen_device(device)
+    model, first_seconds = timed_decode(path, chosen, scene.background)
+    model, decode_seconds = timed_decode(path, chosen, scene.background)
 
     timed_render(
         model, scene.test_views[0].camera
@@ -68,18 +81,21 @@ def evaluate(
     images: list[np.ndarray] = []
     for i, view in enumerate(scene.test_views):
         image, seconds = timed_render(model, view.camera)
+        if exposure:
+            image = exposed_by_left_half(image, view.image, view.mask)
+        seen, photograph, mask = compared(image, view, exposure)
         distance: float | None = None
         if lpips_note is None:
             try:
-                distance = metrics.lpips(image, view.image)
+                distance = metrics.lpips(seen, photograph, mask=mask)
             except metrics.Unavailable as reason:
                 lpips_note = f"unavailable: {reason}"
         rows.append(
             ViewResult(
                 name=view.name,
                 file=f"{i:05d}.png",
-                psnr=metrics.psnr(image, view.image),
-                ssim=metrics.ssim(image, view.image),
+                psnr=metrics.psnr(seen, photograph, mask),
+                ssim=metrics.ssim(seen, photograph, mask),
                 lpips=distance,
                 render_seconds=seconds,
             )
@@ -104,6 +120,8 @@ def evaluate(
         threads=numba.get_num_threads(),
         sha256=hashlib.sha256(data).hexdigest(),
         lpips_note=lpips_note,
+        method=method,
+        exposure=DESCRIPTION if exposure else None,
         per_view=tuple(rows),
         notes=misfits(model.viewpoints, scene),
     )
@@ -112,16 +130,31 @@ def evaluate(
     return results
 
 
+def compared(
+    rendering: np.ndarray, view: View, half: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Rendering, photograph [H, W, 3] and mask [H, W] of what is measured, or of the right `half` of it.
+
+    Raises SceneError if the mask leaves nothing.
+    """
+    photograph, mask = view.image, view.mask
+    if half:
+        rendering, photograph = right_half(rendering), right_half(photograph)
+        mask = None if mask is None else right_half(mask)
+    if mask is not None and not mask.any():
+        where = "of the right half, which is measured, " if half else ""
+        raise SceneError(
+            f"{view.name}: its mask leaves no pixel {where}to evaluate on; mend the mask, or remove the view from the "
+            "poses"
+        )
+    return rendering, photograph, mask
+
+
 def timed_render(model: Renderable, camera: Camera) -> tuple[np.ndarray, float]:
     """[H, W, 3] uint8, and the seconds it took until the image was there."""
     start = working_seconds()
     image = metrics.to_8bit(render(model, camera).image)
     return image, working_seconds() - start
-
-
-def device_name(device: torch.device) -> str:
-    """`cpu`, or the name of the GPU."""
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
 
 def write_evaluation(
@@ -132,18 +165,33 @@ def write_evaluation(
     truth: str = "photograph",
 ) -> None:
     """The files of an evaluation; images of an earlier one with more views are removed."""
-    renders, photographs = folder / "test" / "renders", folder / "test" / "gt"
+    written: set[Path] = set()
+    renders, photographs, masks = (folder / "test" / name for name in ("renders", "gt", "masks"))
+
+    def write(path: Path, image: np.ndarray) -> None:
+        write_bytes(path, encode_png(image))
+        written.add(path)
+
     for row, view, image in zip(results.per_view, views, images, strict=True):
-        write_bytes(renders / row.file, encode_png(image))
-        write_bytes(photographs / row.file, encode_png(view.image))
-    names = {row.file for row in results.per_view}
-    for place in (renders, photographs):
+        write(renders / row.file, image)
+        write(photographs / row.file, view.image)
+        if (mask := view.mask) is not None:
+            write(masks / row.file, mask.astype(np.uint8) * np.uint8(255))
+    for place in (renders, photographs, masks):
         for old in place.glob("[0-9][0-9][0-9][0-9][0-9].png"):
-            if old.name not in names:
+            if old not in written:
                 old.unlink(missing_ok=True)
     chosen = np.unique(np.linspace(0, len(views) - 1, min(SHEET_ROWS, len(views))).round().astype(int))
     sheet = contact_sheet(
-        [(views[i].image, images[i], views[i].name, results.per_view[i].psnr) for i in chosen],
+        [
+            (
+                striped(views[i].image, views[i].mask),
+                striped(images[i], views[i].mask),
+                views[i].name,
+                results.per_view[i].psnr,
+            )
+            for i in chosen
+        ],
         f"{results.scene}: {results.bytes / 1000:.1f} kB, {results.psnr:.2f} dB, {len(views)} held-out views",
         truth,
     )
@@ -154,15 +202,14 @@ def write_evaluation(
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Of a [H, W, 3] uint8 image."""
+    """Of a [H, W, 3] or [H, W] uint8 image."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="PNG")
     return buffer.getvalue()
 
 
-def _timed_decode(
-    path: Path, device: torch.device, background: tuple[float, float, float]
-) -> tuple[Renderable, float]:
+def timed_decode(path: Path, device: str, background: tuple[float, float, float]) -> tuple[Renderable, float]:
+    """The model, and the seconds from file to model."""
     start = working_seconds()
     model = open_scene(path, device, background)
     return model, working_seconds() - start

@@ -3,10 +3,9 @@
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import fmean
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from compgs import metrics
 from compgs.cameras import Camera
@@ -15,11 +14,16 @@ from compgs.codec.decoder import from_latents
 from compgs.codec.reader import read_latents
 from compgs.codec.reduce import with_coarser_covariances, without_coupled
 from compgs.codec.writer import Geometry, write_content
+from compgs.devices import placed
 from compgs.errors import ConfigError
 from compgs.evaluation.importance import importance
+from compgs.evaluation.measure import compared
 from compgs.model.hybrid_model import HybridModel
 from compgs.render import render
 from compgs.scene.views import View
+
+if TYPE_CHECKING:
+    from compgs.devices import Device
 
 COARSEST = 64.0  # times the covariances' step; beyond it, nothing of them is left
 IDENTICAL = 99.0  # dB that identical images count for in a mean
@@ -58,7 +62,7 @@ def reduce_file(
     cameras: Sequence[Camera],
     held_out: Sequence[View] = (),
     geometry: Geometry = "octree",
-    device: str | torch.device | None = None,
+    device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[bytes, Reduction]:
     """The bytes of a smaller file, and its loss.
@@ -70,9 +74,8 @@ def reduce_file(
     Raises ConfigError for other values, or if the file would not become smaller; BitstreamError if it is damaged.
     """
     check_reduction(drop, coarser)
-    chosen = torch.device(device or "cpu")
     content, latents = read_latents(data)
-    model = from_latents(content, latents, chosen)
+    model = placed(from_latents(content, latents), device)
     smaller = content
     if drop > 0:
         smaller = without_coupled(smaller, most_important(model, cameras, drop, progress))
@@ -85,7 +88,7 @@ def reduce_file(
             f"drop {drop:g}, coarser {coarser:g}: the file would take {len(result)} bytes, it has {len(data)}; "
             "ask for more, or keep the file"
         )
-    reduced = from_latents(*read_latents(result), chosen)
+    reduced = placed(from_latents(*read_latents(result)), device)
     return result, Reduction(
         drop=drop,
         coarser=coarser,
@@ -117,7 +120,7 @@ def most_important(
     progress: Callable[[int, int], None] | None = None,
 ) -> np.ndarray:  # [P] bool
     """All coupled primitives but the share `drop` (rounded down) that contributes least; of equal ones the later go."""
-    weights = importance(model, cameras, progress).cpu().numpy()
+    weights = importance(model, cameras, progress)
     kept = np.ones(len(weights), np.bool_)
     # From the end, so that of equal ones the first stay.
     order = len(weights) - 1 - np.argsort(weights[::-1], kind="stable")
@@ -137,5 +140,6 @@ def _image(model: HybridModel, camera: Camera) -> np.ndarray:
 
 
 def _side(data: bytes, model: HybridModel, held_out: Sequence[View]) -> Side:
-    psnr = fmean(metrics.psnr(_image(model, v.camera), v.image) for v in held_out) if held_out else None
+    psnrs = [metrics.psnr(*compared(_image(model, view.camera), view)) for view in held_out]
+    psnr = fmean(psnrs) if psnrs else None
     return Side(len(data), model.anchors, model.coupled, psnr)

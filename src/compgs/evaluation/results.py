@@ -7,6 +7,7 @@
 | schema | "compgs results 1" |
 | compgs | version of the program that evaluated |
 | scene, file | names |
+| method | that wrote the file, if a run evaluated it; else null |
 | views, width, height | number of held-out views; pixels of the first |
 | psnr | dB, mean over the views; null if infinite: all renderings are perfect |
 | ssim | mean over the views |
@@ -19,6 +20,7 @@
 | render_seconds | median over the views, after one view to warm up |
 | device, threads | where it ran |
 | sha256 | of the file |
+| exposure | null, or how renderings got the exposure of their photographs, and what was measured then |
 | notes | sentences: in what the scene is not what the file was trained on, as far as the file's cameras tell |
 
 `per_view.json`: a list in the views' order with `name`, `file` (of `test/renders` and `test/gt`), `psnr`,
@@ -65,7 +67,9 @@ class Results:
     threads: int
     sha256: str
     lpips_note: str | None  # why there is no LPIPS
+    method: str | None  # that wrote the file, where it is known
     per_view: tuple[ViewResult, ...]
+    exposure: str | None = None  # how renderings got that of their photographs; None: they did not
     notes: tuple[str, ...] = ()  # in what the scene is not what the file was trained on (`evaluation/fit.py`)
 
     @property
@@ -108,6 +112,7 @@ class Results:
             "compgs": self.compgs,
             "scene": self.scene,
             "file": self.file,
+            "method": self.method,
             "views": len(self.per_view),
             "width": self.width,
             "height": self.height,
@@ -129,6 +134,7 @@ class Results:
             "device": self.device,
             "threads": self.threads,
             "sha256": self.sha256,
+            "exposure": self.exposure,
             "notes": list(self.notes),
         }
 

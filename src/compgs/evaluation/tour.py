@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,32 +25,61 @@ def tour(
     """`frames` cameras on a smooth way along the given ones, with the first one's field of view across.
 
     The shortest round tour (nearest neighbours, then 2-opt), without its longest leg where that is much longer than
-    the others. Positions by centripetal Catmull-Rom splines, rotations by spherical interpolation; equal pace.
-    Raises UnsupportedCamera for fewer than two cameras.
+    the others; see `way_through`. Raises UnsupportedCamera for fewer than two cameras.
     """
     if len(cameras) < 2:
         raise UnsupportedCamera(f"a way along cameras needs two of them, found {len(cameras)}")
     order, closed = tour_order(cameras)
-    chosen = [cameras[i] for i in order]
+    first = cameras[0]
+    across = first.fx / first.width
+    chosen = [replace(cameras[i], fx=across * cameras[i].width) for i in order]
+    way = way_through(chosen, frames=frames, width=width, height=height, closed=closed)
+    return [(f"tour {i}", camera) for i, camera in enumerate(way)]
+
+
+def way_through(
+    cameras: Sequence[Camera],  # at least 2, in this order
+    *,
+    frames: int,
+    width: int,
+    height: int,
+    closed: bool = False,
+) -> list[Camera]:
+    """`frames` cameras on a smooth way through the given ones, from first to last or, `closed`, on to the first.
+
+    Positions by centripetal Catmull-Rom splines, rotations by spherical interpolation, fields of view across by the
+    ratio of focal length and width. The pace is equal: all turning takes as long as all moving. Raises
+    UnsupportedCamera for fewer than two cameras.
+    """
+    if len(cameras) < 2:
+        raise UnsupportedCamera(f"a way along cameras needs two of them, found {len(cameras)}")
+    chosen = [*cameras, cameras[0]] if closed else list(cameras)
     centers = np.stack([camera.center for camera in chosen])
     rotations = _same_side(np.stack([quaternion_from_rotation(camera.rotation) for camera in chosen]))
-    if closed:
-        centers = np.concatenate([centers, centers[:1]])
-        rotations = _same_side(np.concatenate([rotations, rotations[:1]]))
-    legs = np.maximum(np.linalg.norm(np.diff(centers, axis=0), axis=1), 1e-9 * max(np.ptp(centers), 1e-30))
+    lenses = np.log([camera.fx / camera.width for camera in chosen])
+    legs = _legs(centers, rotations)
     knots = np.concatenate([[0.0], np.cumsum(legs)])
     times = np.linspace(0.0, knots[-1], frames + 1)[:-1] if closed else np.linspace(0.0, knots[-1], frames)
-    first = cameras[0]
-    focal = first.fx * width / first.width
     result = []
-    for i, time in enumerate(times):
+    for time in times:
         leg = min(int(np.searchsorted(knots, time, side="right")) - 1, len(legs) - 1)
         part = (time - knots[leg]) / legs[leg]
         center = _between(centers, leg, part, closed)
         rotation = rotation_from_quaternion(_slerp(rotations[leg], rotations[leg + 1], part))
+        focal = float(np.exp((1 - part) * lenses[leg] + part * lenses[leg + 1])) * width
         pose = rigid(rotation, -rotation @ center)
-        result.append((f"tour {i}", Camera(pose, focal, focal, width / 2, height / 2, width, height)))
+        result.append(Camera(pose, focal, focal, width / 2, height / 2, width, height))
     return result
+
+
+def _legs(centers: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """What each leg takes, above 0: its share of all distances and its share of all turning."""
+    moved = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    turned = np.arccos(np.clip((rotations[:-1] * rotations[1:]).sum(axis=1), -1.0, 1.0))
+    moved[moved <= 1e-12 * np.abs(centers).max()] = 0.0  # rounding errors
+    turned[turned <= 1e-6] = 0.0
+    shares = sum((part / part.sum() for part in (moved, turned) if part.any()), np.zeros(len(moved)))
+    return np.maximum(shares, 1e-9)
 
 
 def tour_order(cameras: Sequence[Camera]) -> tuple[list[int], bool]:
@@ -111,16 +141,19 @@ def _slerp(a: np.ndarray, b: np.ndarray, part: float) -> np.ndarray:
 def _between(points: np.ndarray, leg: int, part: float, closed: bool) -> np.ndarray:
     """On the spline through the points, `part` of the way from one to the next (Barry and Goldman 1988)."""
     n = len(points) - 1
-    before = points[(leg - 1) % n] if closed else points[max(leg - 1, 0)]
-    after = points[(leg + 2) % n] if closed else points[min(leg + 2, n)]
+    if not closed:  # beyond its ends it goes straight on, so that it neither starts nor stops slowly
+        points = np.concatenate([2 * points[:1] - points[1:2], points, 2 * points[-1:] - points[-2:-1]])
+        leg, n = leg + 1, n + 3
+    before, after = points[(leg - 1) % n], points[(leg + 2) % n]
     p = [before, points[leg], points[leg + 1], after]
     knots = [0.0]
     for a, b in itertools.pairwise(p):
         knots.append(knots[-1] + max(float(np.linalg.norm(b - a)) ** 0.5, 1e-12))
     t = knots[1] + part * (knots[2] - knots[1])
     for level in range(1, 4):
+        # As a step from one point: exact where two are in one place, and far from the origin.
         p = [
-            ((knots[i + level] - t) * p[i] + (t - knots[i]) * p[i + 1]) / (knots[i + level] - knots[i])
+            p[i] + (t - knots[i]) / (knots[i + level] - knots[i]) * (p[i + 1] - p[i])
             for i in range(4 - level)
         ]
     return p[0]

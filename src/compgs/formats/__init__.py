@@ -8,9 +8,10 @@
 | .sog 2, zip or meta.json | yes | yes | about 20 |
 | .glb, KHR_gaussian_splatting | yes | yes | 240 |
 | .splat | yes | no | 32, no harmonics |
+| .packed, of a method of the comparison | yes | by `compgs.methods.write` | |
 """
 
-from compgs.formats.arrays import SplatArrays, arrays_of
+from compgs.formats.arrays import SplatArrays
 from compgs.formats.ply import read_ply, write_ply
 from compgs.formats.registry import (
     FORMATS,
@@ -29,7 +30,6 @@ __all__ = [
     "WRITERS",
     "Format",
     "SplatArrays",
-    "arrays_of",
     "check_scene",
     "component_bytes",
     "encoded",

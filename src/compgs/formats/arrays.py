@@ -1,21 +1,29 @@
-"""Splats as files hold them, in NumPy: what readers give and writers take; torch is loaded where a model is made.
+"""What all formats do with splats: limits, conversions, and the check that a reader ends with.
 
 A reader ends with `checked`, so that whatever a file says, a `SplatArrays` from it can be rendered.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from compgs.errors import SplatFileError
+from compgs.model.degrees import MAX_DEGREE, degree_of, harmonics_above_dc
+from compgs.model.splats import ORIGIN, SplatArrays, sigmoid
 
-if TYPE_CHECKING:
-    from compgs.model.splats import Splats
+__all__ = [
+    "MAX_DEGREE",
+    "ORIGIN",
+    "SplatArrays",
+    "check_count",
+    "checked",
+    "degree_of",
+    "harmonics_above_dc",
+    "logit",
+    "normalized",
+    "sigmoid",
+]
 
-MAX_DEGREE = 3
 MAX_LOG_SCALE = 88.0  # its exponential is the largest that float32 holds
 Y0 = 0.28209479177387814  # the harmonic of degree 0: sqrt(1 / 4 pi)
 COLOR_OFFSET = 0.5  # of a color, where all coefficients are zero
@@ -25,81 +33,6 @@ OPACITY_MARGIN = 1e-6
 # memory is taken for them; small files are left alone.
 SPLATS_PER_BYTE = 8
 SMALL_COUNT = 1 << 16
-ORIGIN = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class SplatArrays:
-    """M splats in float32, unactivated: standard deviation = exp(log scale), opacity = sigmoid(logit).
-
-    Means count from `world_offset`, harmonics are in the order of 3DGS (`compgs.model.spherical_harmonics`).
-    """
-
-    means: np.ndarray  # [M, 3] world units
-    log_scales: np.ndarray  # [M, 3]
-    quaternions: np.ndarray  # [M, 4] w-x-y-z, need not be normalized, not zero
-    opacity_logits: np.ndarray  # [M]
-    dc: np.ndarray  # [M, 3] coefficients of degree 0, RGB
-    rest: np.ndarray  # [M, K, 3] of degree 1 to `degree`: K = 0, 3, 8 or 15
-    world_offset: tuple[float, float, float] = ORIGIN  # world units, float64
-
-    def __len__(self) -> int:
-        return len(self.means)
-
-    @property
-    def degree(self) -> int:
-        """Of the harmonics, 0 to 3."""
-        return degree_of(self.rest.shape[1])
-
-    @property
-    def opacities(self) -> np.ndarray:
-        """[M] in [0, 1], float64."""
-        return sigmoid(self.opacity_logits)
-
-    def each(self, change: Callable[[np.ndarray], np.ndarray]) -> "SplatArrays":
-        """The same with every array changed, as by choosing rows."""
-        arrays: dict[str, Any] = {
-            name: change(value) for name, value in vars(self).items() if name != "world_offset"
-        }
-        return replace(self, **arrays)
-
-    def rows(self, index: np.ndarray) -> "SplatArrays":
-        """The splats of an index or a mask."""
-        return self.each(lambda array: array[index])
-
-    def of_degree(self, degree: int) -> "SplatArrays":
-        """Without the harmonics above a degree."""
-        return replace(self, rest=self.rest[:, : harmonics_above_dc(degree)])
-
-    def splats(self) -> "Splats":
-        """For a model; the arrays are copied."""
-        import torch
-
-        from compgs.model.splats import Splats
-
-        arrays = {name: value for name, value in vars(self).items() if name != "world_offset"}
-        return Splats(**{name: torch.tensor(value, dtype=torch.float32) for name, value in arrays.items()})
-
-
-def arrays_of(splats: "Splats", world_offset: tuple[float, float, float] = ORIGIN) -> SplatArrays:
-    """Inverse of `SplatArrays.splats`."""
-    arrays = {name: tensor.detach().cpu().float().numpy() for name, tensor in vars(splats).items()}
-    return SplatArrays(**arrays, world_offset=world_offset)
-
-
-def harmonics_above_dc(degree: int) -> int:
-    """Number of basis functions of degree 1 to `degree`: 0, 3, 8 or 15."""
-    return (degree + 1) ** 2 - 1
-
-
-def degree_of(count: int) -> int:
-    """Inverse of `harmonics_above_dc`."""
-    return next(d for d in range(MAX_DEGREE + 1) if harmonics_above_dc(d) == count)
-
-
-def sigmoid(logits: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        return 1 / (1 + np.exp(-logits.astype(np.float64)))
 
 
 def logit(opacities: np.ndarray) -> np.ndarray:

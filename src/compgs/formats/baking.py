@@ -13,16 +13,16 @@ t_v = w_v / opacity_v what of it the primitives before it let through.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import TrainingError
 from compgs.gaussians import Gaussians
+from compgs.model.degrees import coefficients, degree_of
 from compgs.model.hybrid_model import HybridModel
-from compgs.model.spherical_harmonics import COLOR_OFFSET, Y0, coefficients, harmonic_basis
-from compgs.model.splats import Splats
-from compgs.render import RasterSettings, contributions, local_camera, visible_mask
+from compgs.model.spherical_harmonics import COLOR_OFFSET, Y0, harmonic_basis
+from compgs.model.splats import SplatArrays
+from compgs.render import RasterSettings, blend_of, contributions, local_camera, visible_mask
 
 # Opacity that primitives of anchors in view are given to find out what reaches them, where they are not drawn: it must
 # be above the rasterizer's cutoff, and hide little. Without it a primitive that is there from one side only is there
@@ -34,27 +34,26 @@ HIDDEN_WEIGHT = 0.1
 PENALTY = 1e-4
 MAX_OPACITY = 0.999  # the rasterizer draws nothing more opaque
 CUTOFF = 1 / 255  # opacity below which nothing is drawn
-BLOCK = 1 << 16  # primitives solved at once
+BLOCK = 1 << 14  # primitives worked on at once
 
 
 @dataclass(frozen=True, eq=False)
 class Baked:
     """Splats in the model's local frame, and how much of the cameras' images each of them is."""
 
-    splats: Splats
-    importance: Tensor  # [M] pixels, summed over the cameras
+    splats: SplatArrays
+    importance: np.ndarray  # [M] pixels, summed over the cameras
 
-    def rows(self, index: Tensor) -> "Baked":
-        return Baked(self.splats.rows(index), self.importance.index_select(0, index))
+    def rows(self, index: np.ndarray) -> "Baked":
+        return Baked(self.splats.rows(index), self.importance[index])
 
     def most_important(self, count: int) -> "Baked":
         """As many splats as asked for, in the order in which they were."""
         if count >= len(self.importance):
             return self
-        return self.rows(self.importance.topk(count).indices.sort().values)
+        return self.rows(np.sort(np.argpartition(-self.importance, count)[:count]))
 
 
-@torch.no_grad()
 def bake(
     model: HybridModel,
     cameras: Sequence[Camera],  # of the world
@@ -66,25 +65,28 @@ def bake(
     The cameras should surround what they see and be many more than coefficients: of twelve, pictures between them lose
     2.5 dB against 96. Memory: 1.2 kB a primitive at degree 3. Raises TrainingError if there is nothing to be seen.
     """
-    sums = _Sums.zeros(model.coupled, degree, model.primitives.positions.device)
+    sums = _Sums.zeros(model.coupled, degree)
     settings = RasterSettings(background=model.background)
     for camera in cameras:
         _add_view(sums, model, local_camera(model, camera), settings)
         if progress:
             progress()
-    opacities = (sums.opacity / sums.reaching.clamp_min(1e-12)).clamp(0, MAX_OPACITY)
-    kept = torch.nonzero((sums.weight > 0) & (opacities > CUTOFF)).view(-1)
+    opacities = np.clip(sums.opacity / np.maximum(sums.reaching, np.float32(1e-12)), 0, MAX_OPACITY)
+    kept = np.flatnonzero((sums.weight > 0) & (opacities > CUTOFF))
     if not len(kept):
         raise TrainingError(f"none of {model.coupled} primitives is seen from {len(cameras)} cameras")
-    means, scales, quaternions = (array.index_select(0, kept) for array in model.geometry)
-    harmonics = torch.cat([_solved(sums, rows, degree) for rows in kept.split(BLOCK)])
-    splats = Splats(
+    means, scales, quaternions = (array[kept] for array in model.geometry)
+    blocks = np.split(kept, range(BLOCK, len(kept), BLOCK))
+    harmonics = np.concatenate([_solved(sums, rows, degree) for rows in blocks])
+    shown = opacities[kept].astype(np.float64)
+    splats = SplatArrays(
         means=means,
-        log_scales=scales.log(),
+        log_scales=np.log(scales),
         quaternions=quaternions,
-        opacity_logits=torch.logit(opacities[kept]),
-        dc=harmonics[:, 0].contiguous(),
-        rest=harmonics[:, 1:].contiguous(),
+        opacity_logits=np.log(shown / (1 - shown)).astype(np.float32),
+        dc=np.ascontiguousarray(harmonics[:, 0]),
+        rest=np.ascontiguousarray(harmonics[:, 1:]),
+        world_offset=model.world_offset,
     )
     return Baked(splats, sums.importance[kept])
 
@@ -93,41 +95,42 @@ def bake(
 class _Sums:
     """What is added up over cameras, for each of P primitives."""
 
-    normal: Tensor  # [P, K, K] w Y Y^T
-    colors: Tensor  # [P, K, 3] w Y (color - 1/2)
-    weight: Tensor  # [P] w, with that of hidden views
-    importance: Tensor  # [P] w, pixels
-    opacity: Tensor  # [P] t x opacity
-    reaching: Tensor  # [P] t
+    normal: np.ndarray  # [P, K, K] w Y Y^T
+    colors: np.ndarray  # [P, K, 3] w Y (color - 1/2)
+    weight: np.ndarray  # [P] w, with that of hidden views
+    importance: np.ndarray  # [P] w, pixels
+    opacity: np.ndarray  # [P] t x opacity
+    reaching: np.ndarray  # [P] t
 
     @staticmethod
-    def zeros(count: int, degree: int, device: torch.device) -> "_Sums":
+    def zeros(count: int, degree: int) -> "_Sums":
         k = coefficients(degree)
         shapes = (count, k, k), (count, k, 3), (count,), (count,), (count,), (count,)
-        return _Sums(*(torch.zeros(shape, device=device) for shape in shapes))
+        return _Sums(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
 def _add_view(sums: _Sums, model: HybridModel, camera: Camera, settings: RasterSettings) -> None:
-    """Of a camera of the model's frame."""
+    """Of a camera of the model's frame. A primitive is drawn once in a view: sums need not add up repeated rows."""
     visible = visible_mask(*model.bounds, camera, settings)
     gaussians, drawn = model.drawn(camera, visible)
     shown = gaussians.opacities > CUTOFF  # on a GPU those are there, too, that are not
     gaussians = Gaussians(*(value[shown] for value in vars(gaussians).values()))
     drawn = drawn[shown]
     _add_opacities(sums, model, camera, settings, visible, gaussians, drawn)
-    share = contributions(gaussians, camera, settings)
-    sums.importance.index_add_(0, drawn, share)
-    weight = share + HIDDEN_WEIGHT
-    center = torch.as_tensor(camera.center, dtype=gaussians.means.dtype, device=gaussians.means.device)
-    directions = torch.nn.functional.normalize(gaussians.means - center, dim=1)
-    degree = round(sums.normal.shape[1] ** 0.5) - 1
-    for rows in torch.arange(len(drawn), device=drawn.device).split(BLOCK):
+    share = contributions(gaussians, camera, settings, blend_of(model))
+    sums.importance[drawn] += share
+    weight = share + np.float32(HIDDEN_WEIGHT)
+    offsets = gaussians.means - camera.center.astype(np.float32)
+    directions = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), np.float32(1e-12))
+    degree = degree_of(sums.normal.shape[1] - 1)
+    for start in range(0, len(drawn), BLOCK):
+        rows = slice(start, start + BLOCK)
         basis = harmonic_basis(directions[rows], degree)
         weighted = weight[rows, None] * basis
-        sums.normal.index_add_(0, drawn[rows], weighted[:, :, None] * basis[:, None])
-        offsets = gaussians.colors[rows] - COLOR_OFFSET
-        sums.colors.index_add_(0, drawn[rows], weighted[:, :, None] * offsets[:, None])
-    sums.weight.index_add_(0, drawn, weight)
+        sums.normal[drawn[rows]] += weighted[:, :, None] * basis[:, None]
+        colors = gaussians.colors[rows] - np.float32(COLOR_OFFSET)
+        sums.colors[drawn[rows]] += weighted[:, :, None] * colors[:, None]
+    sums.weight[drawn] += weight
 
 
 def _add_opacities(
@@ -135,30 +138,28 @@ def _add_opacities(
     model: HybridModel,
     camera: Camera,
     settings: RasterSettings,
-    visible: Tensor,  # [N] bool, anchors
-    gaussians: Gaussians,
-    drawn: Tensor,  # [M] int64, which primitives they are
+    visible: np.ndarray,  # [N] bool, anchors
+    gaussians: Gaussians[np.ndarray],
+    drawn: np.ndarray,  # [M] int64, which primitives they are
 ) -> None:
     """Of all primitives of the anchors in view: those that are not drawn have opacity 0, and count with it."""
-    rows = torch.nonzero(visible[model.primitives.anchor_index]).view(-1)
-    opacities = torch.zeros_like(sums.opacity)
+    rows = np.flatnonzero(visible[model.primitives.anchor_index])
+    opacities = np.zeros_like(sums.opacity)
     opacities[drawn] = gaussians.opacities
-    means, scales, quaternions = (array.index_select(0, rows) for array in model.geometry)
-    probes = opacities[rows].clamp_min(PROBE_OPACITY)
-    share = contributions(
-        Gaussians(means, quaternions, scales, probes, torch.zeros_like(means)), camera, settings
-    )
+    means, scales, quaternions = (array[rows] for array in model.geometry)
+    probes = np.maximum(opacities[rows], np.float32(PROBE_OPACITY))
+    probing = Gaussians(means, quaternions, scales, probes, np.zeros_like(means))
+    share = contributions(probing, camera, settings, blend_of(model))
     # Of a Gaussian, what lies above the cutoff is 1 - cutoff / opacity: the rest is not in the share.
-    reaching = share / (probes - CUTOFF)
-    sums.reaching.index_add_(0, rows, reaching)
-    sums.opacity.index_add_(0, rows, reaching * opacities[rows])
+    reaching = share / (probes - np.float32(CUTOFF))
+    sums.reaching[rows] += reaching
+    sums.opacity[rows] += reaching * opacities[rows]
 
 
-def _solved(sums: _Sums, rows: Tensor, degree: int) -> Tensor:
+def _solved(sums: _Sums, rows: np.ndarray, degree: int) -> np.ndarray:
     """[m, K, 3] coefficients of some primitives."""
-    weight = sums.weight[rows, None, None].double()
-    degrees = torch.tensor([float(l) for l in range(degree + 1) for _ in range(2 * l + 1)])
+    weight = sums.weight[rows, None, None].astype(np.float64)
+    degrees = np.array([l for l in range(degree + 1) for _ in range(2 * l + 1)], np.float64)
     # Degree 0 is determined wherever there is a view; its share keeps the matrix from being singular to rounding.
-    penalty = torch.diag(PENALTY * degrees**2 + 1e-9 * Y0**2).to(weight)
-    normal = sums.normal[rows].double() / weight + penalty
-    return torch.linalg.solve(normal, sums.colors[rows].double() / weight).float()
+    normal = sums.normal[rows] / weight + np.diag(PENALTY * degrees**2 + 1e-9 * Y0**2)
+    return np.linalg.solve(normal, sums.colors[rows] / weight).astype(np.float32)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from compgs.errors import BitstreamError, CorruptSection, TruncatedSection
 
 if TYPE_CHECKING:
-    import torch
-
+    from compgs.devices import Device
     from compgs.model.hybrid_model import HybridModel
 
 
@@ -39,7 +38,7 @@ def named(path: Path) -> Iterator[None]:
         raise type(error)(f"{path}: {error}") from error
 
 
-def read(path: Path, device: "torch.device | str") -> "HybridModel":
+def read(path: Path, device: "Device") -> "HybridModel":
     """Raises BitstreamError."""
     from compgs.codec.decoder import decode
 

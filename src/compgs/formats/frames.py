@@ -78,8 +78,6 @@ def rotated_harmonics(rest: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 def basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """`compgs.model.spherical_harmonics.harmonic_basis` of unit vectors [N, 3], in float64."""
-    import torch
+    from compgs.model.spherical_harmonics import harmonic_basis  # loads numba, which few files need
 
-    from compgs.model.spherical_harmonics import harmonic_basis
-
-    return harmonic_basis(torch.from_numpy(np.ascontiguousarray(directions, np.float64)), degree).numpy()
+    return harmonic_basis(directions.astype(np.float64), degree)

@@ -17,7 +17,6 @@ vertices); what it needs must be there, in single or double precision, finite, a
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,15 +24,10 @@ from compgs.errors import SplatFileError
 from compgs.formats.arrays import (
     MAX_DEGREE,
     MAX_LOG_SCALE,
-    ORIGIN,
     SplatArrays,
-    arrays_of,
     harmonics_above_dc,
 )
 from compgs.outputs import check_output_file, write_bytes
-
-if TYPE_CHECKING:
-    from compgs.model.splats import Splats
 
 MAX_HEADER_BYTES = 1 << 16
 _FORMAT = "format binary_little_endian 1.0"
@@ -82,19 +76,13 @@ class PlyHeader:
 # writing -----------------------------------------------------------------------------------------------------------
 
 
-def write_ply(
-    splats: "Splats",
-    path: str | Path,
-    *,
-    world_offset: tuple[float, float, float] = ORIGIN,  # world units: origin of the splats' frame
-    overwrite: bool = False,
-) -> int:
+def write_ply(splats: SplatArrays, path: str | Path, *, overwrite: bool = False) -> int:
     """Write splats, whole or not at all; the number of bytes. Raises OutputError.
 
     Positions in the file are world coordinates, `means + world_offset`, as float32, for that is what other programs
     expect: of a scene 4 000 km from its origin they are whole multiples of 0.25 to 0.5 m.
     """
-    data = encoded(arrays_of(splats, world_offset))
+    data = encoded(splats)
     check_output_file(Path(path), overwrite=overwrite, needed_bytes=len(data))
     write_bytes(Path(path), data)
     return len(data)
@@ -146,9 +134,9 @@ def check(path: Path) -> None:
     read_ply_header(path)
 
 
-def read_ply(path: str | Path) -> "Splats":
+def read_ply(path: str | Path) -> SplatArrays:
     """Inverse of `write_ply`. Raises SplatFileError, naming the first thing that is wrong."""
-    return read(Path(path)).splats()
+    return read(Path(path))
 
 
 def read(path: Path) -> SplatArrays:

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from compgs.devices import placed
 from compgs.errors import NotACompGSFile, OutputError, SplatFileError
-from compgs.formats import cgs, glb, ply, sog, splat, spz
+from compgs.formats import cgs, glb, packed, ply, sog, splat, spz
 from compgs.formats.arrays import SplatArrays
+from compgs.model.splats import SplatModel
 
 if TYPE_CHECKING:
-    import torch
-
+    from compgs.devices import Device
     from compgs.render.render_model import Renderable
 
 HEAD_BYTES = 1 << 12  # enough to tell the formats apart
@@ -26,23 +27,31 @@ class Format:
     begins: Callable[[bytes], bool]  # whether the first bytes are those of such a file
     check: Callable[[Path], None]  # raises for what can be known without reading everything
     component_bytes: Callable[[Path], dict[str, int]]  # by component; they sum to the file's size
-    open: "Callable[[Path, torch.device | str, Background], Renderable]"
+    open: "Callable[[Path, Device, Background], Renderable]"
 
 
 def _opens_splats(
     read: Callable[[Path], SplatArrays],
-) -> "Callable[[Path, torch.device | str, Background], Renderable]":
-    def open_splats(path: Path, device: "torch.device | str", background: Background) -> "Renderable":
-        from compgs.model.splats import SplatModel
-
-        arrays = read(path)
-        return SplatModel(arrays.splats().to(device), background, arrays.world_offset)
+) -> "Callable[[Path, Device, Background], Renderable]":
+    def open_splats(path: Path, device: "Device", background: Background) -> "Renderable":
+        return placed(SplatModel(read(path), background), device)
 
     return open_splats
 
 
-def _open_cgs(path: Path, device: "torch.device | str", background: Background) -> "Renderable":
+def _open_cgs(path: Path, device: "Device", background: Background) -> "Renderable":
     return cgs.read(path, device)
+
+
+def _open_packed(path: Path, device: "Device", background: Background) -> "Renderable":
+    from compgs.methods import METHODS  # the only way up: a method's file says which method reads it
+
+    content = packed.read(path)
+    method = METHODS.get(content.method)
+    if method is None or method.open is None:
+        known = ", ".join(name for name, each in METHODS.items() if each.open) or "none"
+        raise SplatFileError(f"{path}: a file of method {content.method}; known here are those of {known}")
+    return method.open(content, device, background)
 
 
 # In the order in which they are asked; .splat, which nothing marks, is the last.
@@ -52,6 +61,7 @@ FORMATS = (
     Format("spz", spz.begins, spz.check, spz.component_bytes, _opens_splats(spz.read)),
     Format("sog", sog.begins, sog.check, sog.component_bytes, _opens_splats(sog.read)),
     Format("glb", glb.begins, glb.check, glb.component_bytes, _opens_splats(glb.read)),
+    Format("packed", packed.begins, packed.check, packed.component_bytes, _open_packed),
     Format("splat", splat.begins, splat.check, splat.component_bytes, _opens_splats(splat.read)),
 )
 
@@ -95,7 +105,7 @@ def check_scene(path: str | Path) -> None:
 
 def open_scene(
     path: str | Path,
-    device: "torch.device | str" = "cpu",
+    device: "Device" = "cpu",
     background: Background = (
         0.0,
         0.0,

@@ -1,27 +1,27 @@
-"""Hybrid primitives and inter-primitive prediction (CompGS Sec. 3.1, 3.2).
+"""Hybrid primitives and inter-primitive prediction (CompGS Sec. 3.1, 3.2) of scenes that are looked at; splats.
 
-Names are resolved on first use: the kernels and what works on arrays alone (`inference`) need no torch.
+All on numpy arrays; `tensors` has what is trained. Names are resolved on first use.
 """
 
 import importlib
 from typing import TYPE_CHECKING
 
 _HOME = {
-    "HeadDimensions": "heads",
+    "HeadDimensions": "head_weights",
+    "HeadWeights": "head_weights",
     "HybridModel": "hybrid_model",
-    "PredictionHeads": "heads",
-    "Primitives": "primitives",
-    "make_heads": "heads",
-    "predict": "prediction",
+    "PrimitiveArrays": "arrays",
+    "SplatArrays": "splats",
+    "SplatModel": "splats",
 }
 
-__all__ = ["HeadDimensions", "HybridModel", "PredictionHeads", "Primitives", "make_heads", "predict"]
+__all__ = ["HeadDimensions", "HeadWeights", "HybridModel", "PrimitiveArrays", "SplatArrays", "SplatModel"]
 
 if TYPE_CHECKING:
-    from compgs.model.heads import HeadDimensions, PredictionHeads, make_heads
+    from compgs.model.arrays import PrimitiveArrays
+    from compgs.model.head_weights import HeadDimensions, HeadWeights
     from compgs.model.hybrid_model import HybridModel
-    from compgs.model.prediction import predict
-    from compgs.model.primitives import Primitives
+    from compgs.model.splats import SplatArrays, SplatModel
 
 
 def __getattr__(name: str) -> object:

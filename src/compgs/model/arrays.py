@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compgs.model import residual_mlp_kernels as kernels
+from compgs.model import network_kernels as kernels
 
 _A = np.ndarray
 # Weights as the kernels take them, those of `MLPArrays.after_entry` and `MLPArrays.whole`.
@@ -112,7 +112,7 @@ class MLPArrays:
         index: np.ndarray,  # [M] int64, ascending: row of `features` of each coupled primitive
         rows: np.ndarray = ALL_ROWS,  # [M] int64, ascending: their rows of `residuals`
     ) -> np.ndarray:  # [M, O]
-        """One row of outputs per coupled primitive: the kernels' twin of `ResidualMLP.forward`."""
+        """One row of outputs per coupled primitive: the kernels' twin of `tensors.residual_mlp.ResidualMLP`."""
         out = np.empty((len(index), self.output_weight.shape[1]), np.float32)
         kernels.forward(residuals, rows, index, self.begin(features), *self.after_entry, out)
         return out

@@ -154,15 +154,17 @@ class SeparateArrays(HeadArrays):
         unit = np.float32(scene.distance_unit)
         kernels.see(anchors, p.positions, p.references, center, unit, seen)
         counts = first[anchors + 1] - first[anchors]
-        row = np.repeat(np.arange(len(anchors)), counts)  # of `seen`, for each coupled primitive in view
+        row = np.repeat(
+            np.arange(len(anchors), dtype=np.int64), counts
+        )  # of `seen`, for each coupled primitive in view
         # Their places among all: the anchors' ranges, one after the other.
-        coupled = np.arange(len(row)) + (first[anchors + 1] - np.cumsum(counts))[row]
+        coupled = np.arange(len(row), dtype=np.int64) + (first[anchors + 1] - np.cumsum(counts))[row]
         opacities = np.empty(len(row), np.float32)
         kernels.activate_opacities(self.opacity_network.apply(seen, p.residuals, row, coupled), opacities)
         shown = np.nonzero(opacities > kernels.CUTOFF)[0]
         index, colors = coupled[shown], np.empty((len(shown), 3), np.float32)
         raw = self.color_network.apply(seen, p.residuals, row[shown], index)
-        kernels.activate_colors(raw, np.arange(len(shown)), colors)
+        kernels.activate_colors(raw, np.arange(len(shown), dtype=np.int64), colors)
         g, geometry = scene.geometry, GeometryArrays.empty(len(index))
         kernels.gather_geometry(index, *g.fields, *geometry.fields)
         return DrawnArrays(index, geometry, opacities[shown], colors)

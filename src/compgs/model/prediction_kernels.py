@@ -1,5 +1,5 @@
-"""Sec. 3.2 on the CPU, on numpy arrays: activations, cutoff, affine map and view embedding. `prediction.py` is its
-readable twin; training and rendering both compute by the few functions at the top.
+"""Sec. 3.2 on the CPU, on numpy arrays: activations, cutoff, affine map and view embedding. Its readable twin is
+`tensors/prediction.py`; training and rendering both compute by the few functions at the top.
 
     anchors in view ──► [f, v] times the anchors' weights ─┐
     residuals g ───────────────────────────────────────────┴─► network ──► opacity, color ──► those drawn, with geometry
@@ -16,8 +16,9 @@ import numpy as np
 from numba import prange
 
 from compgs.model.constants import OPACITY_CUTOFF, SMALLEST_DISTANCE
-from compgs.model.residual_mlp_kernels import ANCHORS, CHUNKS, ROWS, activations, begin_block, tiled
+from compgs.model.network_kernels import ANCHORS, ROWS, TASKS, begin_block, hidden_layers, tiled
 from compgs.numerics.compiled import njit
+from compgs.numerics.products import multiply
 
 _FASTMATH = {"contract", "nsz", "arcp"}
 _f32 = np.float32
@@ -233,8 +234,7 @@ def paired_appearance(
 ):
     V, D, G, H = len(anchors), references.shape[1], residuals.shape[1], len(output_weight)
     blocks, layers = len(drawn), len(weights1)
-    # Several blocks to a task: scratch memory is allocated once per task.
-    tasks = min(blocks, 8 * CHUNKS)
+    tasks = min(blocks, TASKS)
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
     for t in prange(tasks):
         seen = np.empty((ANCHORS, D + 4), np.float32)
@@ -243,7 +243,7 @@ def paired_appearance(
         row = np.empty(ROWS, np.int64)
         first = np.empty((ROWS, H + 4), np.float32)
         x = np.empty((layers + 1, ROWS, H), np.float32)
-        h = np.empty((layers, ROWS, H), np.float32)
+        h = np.empty((ROWS, H), np.float32)
         for block in range(blocks * t // tasks, blocks * (t + 1) // tasks):
             v0, v1 = block * ANCHORS, min(V, (block + 1) * ANCHORS)
             _see_block(anchors[v0:v1], positions, references, center, distance_unit, seen)
@@ -259,7 +259,7 @@ def paired_appearance(
                     row[i] = v - v0
                     for c in range(G):
                         own[i, c] = residuals[p, c]
-                activations(
+                hidden_layers(
                     own[:n],
                     row[:n],
                     shared,
@@ -273,7 +273,7 @@ def paired_appearance(
                     h,
                 )
                 out = appearance[place : place + n]
-                np.dot(x[layers, :n], output_weight, out)
+                multiply(x[layers, :n], output_weight, out)
                 count += _activate(out, first, H)
                 place += n
             drawn[block] = count

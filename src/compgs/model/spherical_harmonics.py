@@ -5,15 +5,16 @@
 Order and signs are those of 3DGS files: bands l = 0, 1, 2, 3, in each m = -l ... l; Y carries the Condon-Shortley phase
 (-1)^m, so that Y_1 = sqrt(3 / 4 pi) (-y, z, -x). A file looks the same here as in other viewers only because of it.
 
-On the CPU in float32 `spherical_harmonics_kernels.py` does it, in one pass each way; elsewhere the plain torch here.
+On numpy arrays; `tensors/spherical_harmonics.py` has the same on torch tensors, in any precision and on any device.
 """
 
-from typing import Any
+from typing import Any, cast
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from compgs.gaussians import Array
 from compgs.model import spherical_harmonics_kernels as kernels
+from compgs.model.degrees import degree_of
 from compgs.model.spherical_harmonics_kernels import (
     Y0,
     Y1,
@@ -27,102 +28,59 @@ from compgs.model.spherical_harmonics_kernels import (
     Y3_ZXX,
 )
 
-MAX_DEGREE = 3
 COLOR_OFFSET = 0.5  # gray, where all coefficients are zero
 
 
-def coefficients(degree: int) -> int:
-    """Number of basis functions up to a degree: 1, 4, 9 or 16."""
-    return (degree + 1) ** 2
-
-
-def dc_from_color(colors: Tensor) -> Tensor:
-    """The coefficient of degree 0 that gives a color (display RGB) in all directions."""
-    return (colors - COLOR_OFFSET) / Y0
-
-
-def harmonic_basis(directions: Tensor, degree: int) -> Tensor:  # [M, 3] unit -> [M, (degree + 1)^2]
-    """The basis functions in the order of the file."""
-    x, y, z = directions.unbind(1)
-    values = [torch.full_like(x, Y0)]
-    if degree >= 1:
-        values += [-Y1 * y, Y1 * z, -Y1 * x]
-    xx, yy, zz = x * x, y * y, z * z
+def harmonics(x: Array, y: Array, z: Array, degree: int) -> list[Array]:  # each [M], of unit vectors
+    """The basis functions of degree 1 to `degree` in the order of the file, each [M]; of arrays or tensors alike."""
+    a, b, c = cast("tuple[Any, Any, Any]", (x, y, z))
+    values = [-Y1 * b, Y1 * c, -Y1 * a] if degree >= 1 else []
+    aa, bb, cc = a * a, b * b, c * c
     if degree >= 2:
-        values += [Y2_XY * x * y, -Y2_XY * y * z, Y2_Z * (2 * zz - xx - yy)]
-        values += [-Y2_XY * x * z, Y2_XX * (xx - yy)]
+        values += [Y2_XY * a * b, -Y2_XY * b * c, Y2_Z * (2 * cc - aa - bb)]
+        values += [-Y2_XY * a * c, Y2_XX * (aa - bb)]
     if degree >= 3:
-        values += [-Y3_3 * y * (3 * xx - yy), Y3_XYZ * x * y * z, -Y3_1 * y * (4 * zz - xx - yy)]
-        values += [Y3_Z * z * (2 * zz - 3 * xx - 3 * yy), -Y3_1 * x * (4 * zz - xx - yy)]
-        values += [Y3_ZXX * z * (xx - yy), -Y3_3 * x * (xx - 3 * yy)]
-    return torch.stack(values, 1)
+        values += [-Y3_3 * b * (3 * aa - bb), Y3_XYZ * a * b * c, -Y3_1 * b * (4 * cc - aa - bb)]
+        values += [Y3_Z * c * (2 * cc - 3 * aa - 3 * bb), -Y3_1 * a * (4 * cc - aa - bb)]
+        values += [Y3_ZXX * c * (aa - bb), -Y3_3 * a * (aa - 3 * bb)]
+    return values
+
+
+def harmonic_basis(directions: np.ndarray, degree: int) -> np.ndarray:  # [M, 3] unit -> [M, (degree + 1)^2]
+    """The basis functions, with that of degree 0, in the precision of the directions."""
+    x, y, z = directions.T
+    return np.stack([np.full_like(x, Y0), *harmonics(x, y, z, degree)], 1)
 
 
 def view_colors(
-    means: Tensor,  # [M, 3] world units
-    dc: Tensor,  # [M, 3] coefficients of degree 0
-    rest: Tensor,  # [M, K, 3] of the degrees above, K at least (degree + 1)^2 - 1; what is beyond is not used
-    center: Tensor,  # [3] of the camera, world units
-    degree: int,
-    visible: Tensor | None = None,  # [M] bool: splats to look at, the others become black; default all
-) -> Tensor:  # [M, 3] display RGB, not below 0
-    """What a camera sees of each splat; gradients go to means and coefficients."""
-    assert 0 <= degree <= MAX_DEGREE and rest.shape[1] >= coefficients(degree) - 1, (degree, rest.shape)
-    if means.device.type == "cpu" and means.dtype == torch.float32:
-        if visible is None:
-            visible = torch.ones(len(means), dtype=torch.bool)
-        colors: Tensor = _ViewColors.apply(means, dc, rest, center, degree, visible)
-        return colors
-    return view_colors_reference(means, dc, rest, center, degree, visible)
+    means: np.ndarray,  # [M, 3] float32, world units
+    dc: np.ndarray,  # [M, 3] float32, coefficients of degree 0
+    rest: np.ndarray,  # [M, K, 3] float32, of the degrees above; all are used
+    center: np.ndarray,  # [3] of the camera, world units
+) -> np.ndarray:  # [M, 3] float32, display RGB, not below 0
+    """What a camera sees of each splat."""
+    means, dc, rest = (np.require(a, np.float32, ("C", "W")) for a in (means, dc, rest))
+    degree = degree_of(rest.shape[1])
+    colors = np.empty_like(means)
+    kernels.view_colors(
+        means, dc, rest, center.astype(np.float32), np.ones(len(means), np.bool_), degree, colors
+    )
+    return colors
 
 
-def view_colors_reference(
-    means: Tensor, dc: Tensor, rest: Tensor, center: Tensor, degree: int, visible: Tensor | None = None
-) -> Tensor:
-    """`view_colors` in plain torch, on any device and in any precision."""
-    directions = torch.nn.functional.normalize(means - center, dim=1)
-    basis = harmonic_basis(directions, degree)
-    used = rest[:, : basis.shape[1] - 1]
-    colors = COLOR_OFFSET + Y0 * dc + (basis[:, 1:, None] * used).sum(1)
-    colors = colors.clamp_min(0)
-    return colors if visible is None else torch.where(visible[:, None], colors, 0.0)
-
-
-class _ViewColors(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, center: Tensor, degree: int, visible: Tensor
-    ) -> Tensor:
-        means, dc, rest, center, visible = (
-            t.detach().contiguous() for t in (means, dc, rest, center, visible)
-        )
-        colors = torch.empty_like(means)
-        kernels.view_colors(
-            means.numpy(),
-            dc.numpy(),
-            rest.numpy(),
-            center.numpy(),
-            visible.numpy(),
-            degree,
-            colors.numpy(),
-        )
-        ctx.save_for_backward(means, dc, rest, center, colors)
-        ctx.degree = degree
-        return colors
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        means, dc, rest, center, colors = ctx.saved_tensors
-        d_means, d_dc, d_rest = (torch.empty_like(t) for t in (means, dc, rest))
-        kernels.view_colors_gradient(
-            means.numpy(),
-            rest.numpy(),
-            center.numpy(),
-            ctx.degree,
-            colors.detach().numpy(),
-            gradients[0].contiguous().numpy(),
-            d_means.numpy(),
-            d_dc.numpy(),
-            d_rest.numpy(),
-        )
-        return d_means, d_dc, d_rest, None, None, None
+def view_colors_gradient(
+    means: np.ndarray,  # [M, 3] float32, world units
+    rest: np.ndarray,  # [M, K, 3] float32
+    center: np.ndarray,  # [3] of the camera, world units
+    colors: np.ndarray,  # [M, 3] from `view_colors`
+    d_colors: np.ndarray,  # [M, 3] gradient by them
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients by the coefficients of degree 0 [M, 3] and above [M, K, 3]."""
+    means, rest = (np.require(a, np.float32, ("C", "W")) for a in (means, rest))
+    degree = degree_of(rest.shape[1])
+    d_means, d_dc, d_rest = np.empty_like(means), np.empty_like(means), np.empty_like(rest)
+    center = center.astype(np.float32)
+    kernels.view_colors_gradient(
+        means, rest, center, degree, colors, np.ascontiguousarray(d_colors), d_means, d_dc, d_rest
+    )
+    return d_dc, d_rest

@@ -1,69 +1,77 @@
 """Independent splats with view-dependent color: what plain 3DGS and files of splats hold (Kerbl et al. 2023).
 
-`Splats` are the stored, unactivated numbers; `splat_gaussians` activates them for a camera; `SplatModel` is a scene of
-them that can be rendered.
+`SplatArrays` are the stored, unactivated numbers, on numpy arrays; `SplatModel` is a scene of them that can be
+rendered. `tensors/splats.py` has the splats that are trained.
 """
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.model.constants import CUTOFF_SIGMAS
-from compgs.model.spherical_harmonics import coefficients, view_colors
+from compgs.model.degrees import degree_of, harmonics_above_dc
+
+ORIGIN = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Splats:
-    """M splats as they are stored: standard deviation = exp(log scale), opacity = sigmoid(logit)."""
+class SplatArrays:
+    """M splats in float32, unactivated: standard deviation = exp(log scale), opacity = sigmoid(logit).
 
-    means: Tensor  # [M, 3] world units
-    log_scales: Tensor  # [M, 3]
-    quaternions: Tensor  # [M, 4] w-x-y-z, need not be normalized, not zero
-    opacity_logits: Tensor  # [M]
-    dc: Tensor  # [M, 3] harmonic coefficients of degree 0, RGB
-    rest: Tensor  # [M, K, 3] of degree 1 to `degree`: K = 0, 3, 8 or 15
+    Means count from `world_offset`, harmonics are in the order of 3DGS (`compgs.model.spherical_harmonics`).
+    """
+
+    means: np.ndarray  # [M, 3] world units
+    log_scales: np.ndarray  # [M, 3]
+    quaternions: np.ndarray  # [M, 4] w-x-y-z, need not be normalized, not zero
+    opacity_logits: np.ndarray  # [M]
+    dc: np.ndarray  # [M, 3] coefficients of degree 0, RGB
+    rest: np.ndarray  # [M, K, 3] of degree 1 to `degree`: K = 0, 3, 8 or 15
+    world_offset: tuple[float, float, float] = ORIGIN  # world units, float64
 
     def __len__(self) -> int:
         return len(self.means)
 
     @property
     def degree(self) -> int:
-        """Of the spherical harmonics, 0 to 3."""
-        return next(d for d in range(4) if coefficients(d) - 1 == self.rest.shape[1])
+        """Of the harmonics, 0 to 3."""
+        return degree_of(self.rest.shape[1])
 
-    def to(self, device: torch.device | str) -> "Splats":
-        return Splats(**{name: tensor.to(device) for name, tensor in vars(self).items()})
+    @property
+    def opacities(self) -> np.ndarray:
+        """[M] in [0, 1], float64."""
+        return sigmoid(self.opacity_logits.astype(np.float64))
 
-    def rows(self, index: Tensor) -> "Splats":
-        """The splats of an index [V] int64."""
-        return Splats(**{name: tensor.index_select(0, index) for name, tensor in vars(self).items()})
+    def each(self, change: Callable[[np.ndarray], np.ndarray]) -> "SplatArrays":
+        """The same with every array changed, as by choosing rows."""
+        arrays: dict[str, Any] = {
+            name: change(value) for name, value in vars(self).items() if name != "world_offset"
+        }
+        return replace(self, **arrays)
 
+    def rows(self, index: np.ndarray) -> "SplatArrays":
+        """The splats of an index or a mask."""
+        return self.each(lambda array: array[index])
 
-def splat_gaussians(
-    splats: Splats, camera: Camera, degree: int | None = None, visible: Tensor | None = None
-) -> Gaussians:
-    """What a camera sees, differentiable. `degree` of the harmonics to use, all by default; splats outside of
-    `visible` [M] bool are given without color: they must not reach the image.
-    """
-    center = torch.as_tensor(camera.center, dtype=splats.means.dtype, device=splats.means.device)
-    degree = splats.degree if degree is None else degree
-    return Gaussians(
-        splats.means,
-        splats.quaternions,
-        splats.log_scales.exp(),
-        splats.opacity_logits.sigmoid(),
-        view_colors(splats.means, splats.dc, splats.rest, center, degree, visible),
-    )
+    def of_degree(self, degree: int) -> "SplatArrays":
+        """Without the harmonics above a degree."""
+        return replace(self, rest=self.rest[:, : harmonics_above_dc(degree)])
 
 
-def splat_radii(splats: Splats) -> Tensor:
-    """[M] world units: of spheres beyond which nothing of a splat is drawn."""
-    return CUTOFF_SIGMAS * splats.log_scales.detach().amax(1).exp()
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """In the precision of the logits."""
+    with np.errstate(over="ignore"):
+        return 1 / (1 + np.exp(-logits))
+
+
+def splat_radii(log_scales: np.ndarray) -> np.ndarray:
+    """[M] float32, world units: of spheres beyond which nothing of a splat is drawn; log_scales [M, 3]."""
+    return np.float32(CUTOFF_SIGMAS) * np.exp(log_scales.max(1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +82,14 @@ class SplatModel:
     `compgs.render` takes cameras of the world and moves them.
     """
 
-    splats: Splats
+    splats: SplatArrays
     background: tuple[float, float, float]  # RGB, 0 to 1
-    # world units, float64: origin of the local frame
-    world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     viewpoints: tuple[Camera, ...] = ()  # files of splats keep none
+
+    @property
+    def world_offset(self) -> tuple[float, float, float]:
+        """World units, float64: origin of the local frame."""
+        return self.splats.world_offset
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -88,22 +99,34 @@ class SplatModel:
     def most_gaussians(self) -> int:
         return len(self.splats)
 
+    def at(self, world_offset: tuple[float, float, float]) -> "SplatModel":
+        """The same with positions that count from another place."""
+        return replace(self, splats=replace(self.splats, world_offset=world_offset))
+
     def over(self, background: tuple[float, float, float]) -> "SplatModel":
         """The same over another background."""
         return replace(self, background=background)
 
     @functools.cached_property
-    def bounds(self) -> tuple[Tensor, Tensor]:
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Spheres that hold what is drawn of a splat: centres [M, 3] and radii [M], world units."""
-        return self.splats.means, splat_radii(self.splats)
+        return self.splats.means, splat_radii(self.splats.log_scales)
 
-    @torch.no_grad()
-    def gaussians(self, camera: Camera, visible: Tensor | None = None) -> Gaussians:
+    @functools.cached_property
+    def _activated(self) -> tuple[np.ndarray, np.ndarray]:
+        """Standard deviations [M, 3], world units, and opacities [M]."""
+        return np.exp(self.splats.log_scales), sigmoid(self.splats.opacity_logits)
+
+    def gaussians(self, camera: Camera, visible: np.ndarray | None = None) -> Gaussians[np.ndarray]:
         """What a camera sees. `visible` [M] bool: splats to look at; all of them if not given."""
-        if visible is None:
-            return splat_gaussians(self.splats, camera)
-        return splat_gaussians(self.splats.rows(torch.nonzero(visible).view(-1)), camera)
+        from compgs.model.spherical_harmonics import view_colors
 
-    def parts(self, camera: Camera, visible: Tensor | None = None) -> Iterator[Gaussians]:
+        s, (scales, opacities) = self.splats, self._activated
+        chosen = slice(None) if visible is None else np.flatnonzero(visible)
+        means = s.means[chosen]
+        colors = view_colors(means, s.dc[chosen], s.rest[chosen], camera.center)
+        return Gaussians(means, s.quaternions[chosen], scales[chosen], opacities[chosen], colors)
+
+    def parts(self, camera: Camera, visible: np.ndarray | None = None) -> Iterator[Gaussians[np.ndarray]]:
         """The same, as one part: splats are in memory anyway."""
         yield self.gaussians(camera, visible)

@@ -1,19 +1,19 @@
-"""Structural similarity (Wang et al. 2004) as 3DGS computes it, alone and fused with L1 and the gradient.
+"""Structural similarity (Wang et al. 2004) as 3DGS computes it, fused with L1 and the gradient, on the CPU.
 
 `x` is the image, `y` the target, both [H, W, 3] in 0 to 1; every channel by itself. m, n are their local
 means under an 11 x 11 Gaussian window (sigma 1.5, zeros outside the image), v, w the local variances, c the
 local covariance:
 
     SSIM = (2 m n + C1) (2 c + C2) / ((m^2 + n^2 + C1) (v + w + C2)),    averaged over pixels and channels
+
+With a mask, pixels that do not count are treated as those outside of the image: zero in both for the windows that reach
+them, and not averaged over.
 """
 
-import functools
 import math
 
 import numpy as np
-import torch
 from numba import prange
-from torch import Tensor
 
 from compgs.numerics.compiled import njit
 from compgs.numerics.vector_sums import add_in_any_order
@@ -29,26 +29,6 @@ def window() -> np.ndarray:
     offset = np.arange(WINDOW_SIZE) - WINDOW_SIZE // 2
     weight = np.exp(-0.5 * (offset / WINDOW_SIGMA) ** 2)
     return weight / weight.sum()
-
-
-@functools.lru_cache(maxsize=16)
-def window_on(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`window` on a device; kept, as a copy to a GPU waits for it to finish its work."""
-    return torch.as_tensor(window(), dtype=dtype, device=device)
-
-
-def ssim(x: Tensor, y: Tensor) -> Tensor:
-    """Mean SSIM of [H, W, 3] images: plain torch, any device and type."""
-    taps = window_on(x.dtype, x.device)
-
-    def blur(maps: Tensor) -> Tensor:  # [N, 1, H, W]
-        maps = torch.nn.functional.conv2d(maps, taps.view(1, 1, -1, 1), padding=(WINDOW_SIZE // 2, 0))
-        return torch.nn.functional.conv2d(maps, taps.view(1, 1, 1, -1), padding=(0, WINDOW_SIZE // 2))
-
-    maps = torch.cat([x, y, x * x, y * y, x * y], 2).permute(2, 0, 1)[:, None]
-    m, n, xx, yy, xy = blur(maps).view(5, 3, *x.shape[:2])
-    similarity = (2 * m * n + C1) * (2 * (xy - m * n) + C2)
-    return (similarity / ((m * m + n * n + C1) * (xx - m * m + yy - n * n + C2))).mean()
 
 
 # fused: CPU, float32 ----------------------------------------------------------------------------------------
@@ -100,8 +80,9 @@ def _add_products(S, at, x, y, scale, weight):
 
 
 @njit(fastmath=_FASTMATH, error_model="numpy")
-def _similarity(S, n):
-    """Sum of SSIM over n elements of a row; its gradient by m, xx and xy goes to scratch rows 5 to 7."""
+def _similarity(S, n, counts=None):
+    """Sum of SSIM over n elements of a row, times `counts` [n] float32 (None: one); its gradient by m, xx and xy goes
+    to scratch rows 5 to 7."""
     total = _ZERO
     for i in range(_u(n)):
         m, k = _across(S, i), _across(S, i + _S1)
@@ -110,10 +91,13 @@ def _similarity(S, n):
         b1, b2 = m * m + k * k + _C1, xx - m * m + yy - k * k + _C2
         inverse = _ONE / (b1 * b2)
         value = a1 * a2 * inverse
-        total = add_in_any_order(total, value)
+        d_m = _TWO * inverse * (k * (a2 - a1) + m * value * (b1 - b2))
         d_xx = -value * b1 * inverse
         d_xy = _TWO * a1 * inverse
-        S[i + _S5] = _TWO * inverse * (k * (a2 - a1) + m * value * (b1 - b2))
+        if counts is not None:
+            value, d_m, d_xx, d_xy = counts[i] * value, counts[i] * d_m, counts[i] * d_xx, counts[i] * d_xy
+        total = add_in_any_order(total, value)
+        S[i + _S5] = d_m
         S[i + _S6] = d_xx
         S[i + _S7] = d_xy
     return total
@@ -150,8 +134,11 @@ def _absolute_difference(x, y, scale):
 
 
 @njit(parallel=True)
-def _compare(x, y, scale, maps, sums):
-    """x, y [H, 3 W] -> sums [H, 2] of |x - y| and SSIM by row, maps [H, 3, 3 W] of the gradient of SSIM."""
+def _compare(x, y, scale, maps, sums, counts):
+    """x, y [H, 3 W] -> sums [H, 2] of |x - y| and SSIM by row, maps [H, 3, 3 W] of the gradient of SSIM.
+
+    counts [H, 3 W] float32: factors on SSIM at each element; None: one.
+    """
     H, W = x.shape
     for r in prange(H):
         S = np.empty(_SCRATCH, np.float32)
@@ -165,7 +152,10 @@ def _compare(x, y, scale, maps, sums):
                 if 0 <= row < H:
                     at = left - (first - _HALO)
                     _add_products(S, at, x[row, left:right], y[row, left:right], scale, _TAPS[k])
-            similarity += _similarity(S, last - first)
+            if counts is None:
+                similarity += _similarity(S, last - first)
+            else:
+                similarity += _similarity(S, last - first, counts[r, first:last])
             for q in range(3):
                 maps[r, q, first:last] = S[(5 + q) * _STRIDE : (5 + q) * _STRIDE + last - first]
         sums[r, 0] = _absolute_difference(x[r], y[r], scale)
@@ -197,18 +187,31 @@ def l1_and_ssim(
     y: np.ndarray,  # [H, W, 3] uint8 or float32, C order
     ssim_weight: float = 0.2,
     want_gradient: bool = False,
+    counted: np.ndarray | None = None,  # [H, W] bool: pixels to average over; None: all
 ) -> tuple[float, float, np.ndarray | None]:
-    """Mean |x - y|, mean SSIM, and the gradient [H, W, 3] of (1 - w) L1 + w (1 - SSIM) by x."""
+    """Mean |x - y|, mean SSIM, and the gradient [H, W, 3] of (1 - w) L1 + w (1 - SSIM) by x.
+
+    Where no pixel counts, nothing differs: 0, 1 and a gradient of zeros.
+    """
     H = x.shape[0]
     scale = _f(1.0 / 255.0 if y.dtype == np.uint8 else 1.0)
+    elements, counts = x.size, None
+    if counted is not None:
+        elements = max(3 * int(np.count_nonzero(counted)), 1)
+        x, y = x * counted[:, :, None], y * counted[:, :, None]
+        counts = np.repeat(counted.astype(np.float32), 3, axis=1)
     rows_x, rows_y = x.reshape(H, -1), y.reshape(H, -1)
     maps = np.empty((H, 3, rows_x.shape[1]), np.float32)
     sums = np.empty((H, 2))
-    _compare(rows_x, rows_y, scale, maps, sums)
-    l1, similarity = math.fsum(sums[:, 0]) / x.size, math.fsum(sums[:, 1]) / x.size
+    _compare(rows_x, rows_y, scale, maps, sums, counts)
+    l1, similarity = math.fsum(sums[:, 0]) / elements, math.fsum(sums[:, 1]) / elements
+    if counted is not None and not counted.any():
+        similarity = 1.0
     if not want_gradient:
         return l1, similarity, None
     gradient = np.empty_like(x)
-    l1_factor, ssim_factor = _f((1.0 - ssim_weight) / x.size), _f(-ssim_weight / x.size)
+    l1_factor, ssim_factor = _f((1.0 - ssim_weight) / elements), _f(-ssim_weight / elements)
     _compare_gradient(rows_x, rows_y, scale, maps, ssim_factor, l1_factor, gradient.reshape(H, -1))
+    if counted is not None:
+        gradient *= counted[:, :, None]
     return l1, similarity, gradient

@@ -1,7 +1,6 @@
 """Features, matches, poses: COLMAP's three stages, in a process of their own that is watched from here."""
 
 import contextlib
-import importlib.util
 import json
 import sqlite3
 import subprocess
@@ -13,7 +12,8 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Literal
 
-from compgs.errors import MissingDependency, SceneError, install_line
+from compgs.errors import SceneError
+from compgs.extras import require
 from compgs.reconstruct.cameras import SharedCamera
 
 Stage = Literal["features", "matching", "mapping"]
@@ -42,8 +42,7 @@ class Job:
 
 def check_colmap() -> None:
     """Raises MissingDependency, with the remedy, where pycolmap is not installed."""
-    if importlib.util.find_spec("pycolmap") is None:
-        raise MissingDependency(f"finding poses needs pycolmap: {install_line('reconstruct')}")
+    require("reconstruct", "finding poses")
 
 
 def run_colmap(job: Job, photographs: int, progress: Progress) -> None:

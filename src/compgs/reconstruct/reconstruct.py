@@ -53,7 +53,7 @@ class Reconstruction:
     points: int
     reprojection_error: float  # pixels, mean over the points
     observations: float  # points seen by a photograph, mean
-    models: int  # parts that could not be joined; the largest is the scene
+    models: int  # that COLMAP made, from different first pairs; the largest is the scene
     lens: str
     matching: str
     seconds: dict[str, float]  # by stage

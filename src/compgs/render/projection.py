@@ -10,12 +10,9 @@ so results do not depend on the number of threads.
 """
 
 import math
-from typing import Any
 
 import numpy as np
-import torch
 from numba import prange
-from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.numerics.compiled import njit
@@ -281,54 +278,3 @@ def project_backward(
             grad_scales[j, 0] = s[i + SX]
             grad_scales[j, 1] = s[i + SY]
             grad_scales[j, 2] = s[i + SZ]
-
-
-class Project(torch.autograd.Function):
-    """means2d [M, 2], covariances [M, 3] (xx, xy, yy); without gradient: depths [M], determinants [M]."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, numbers: np.ndarray
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        m = len(means)
-        means2d, covariances = means.new_empty(m, 2), means.new_empty(m, 3)
-        depths, determinants = means.new_empty(m), means.new_empty(m)
-        project_forward(
-            as_array(means),
-            as_array(quaternions),
-            as_array(scales),
-            numbers,
-            as_array(means2d),
-            as_array(covariances),
-            as_array(depths),
-            as_array(determinants),
-        )
-        ctx.save_for_backward(means, quaternions, scales, depths)
-        ctx.numbers = numbers
-        ctx.mark_non_differentiable(depths, determinants)
-        return means2d, covariances, depths, determinants
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        means, quaternions, scales, depths = ctx.saved_tensors
-        grad_means, grad_quaternions, grad_scales = (
-            torch.empty(t.shape) for t in (means, quaternions, scales)
-        )
-        project_backward(
-            as_array(means),
-            as_array(quaternions),
-            as_array(scales),
-            ctx.numbers,
-            as_array(depths),
-            as_array(gradients[0]),
-            as_array(gradients[1]),
-            as_array(grad_means),
-            as_array(grad_quaternions),
-            as_array(grad_scales),
-        )
-        return grad_means, grad_quaternions, grad_scales, None
-
-
-def as_array(tensor: Tensor) -> np.ndarray:
-    """The tensor's own memory; a copy only where it is not contiguous."""
-    return tensor.detach().contiguous().numpy()

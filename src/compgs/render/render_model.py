@@ -4,13 +4,13 @@ import functools
 from collections.abc import Iterator, Mapping
 from typing import Protocol, runtime_checkable
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import ConfigError
 from compgs.gaussians import Gaussians
-from compgs.render.rasterize import rasterize_parts
+from compgs.render.contributions import Blend, Blended
+from compgs.render.rasterize import blended, rasterize_parts
 from compgs.render.result import RasterResult
 from compgs.render.settings import RasterSettings
 from compgs.render.visibility import visible_mask
@@ -20,7 +20,7 @@ from compgs.render.visibility import visible_mask
 class Renderable(Protocol):
     """A scene: says which Gaussians a camera sees. What a decoder, a reader of a file or a training gives.
 
-    Everything is in the model's local frame, world coordinates minus `world_offset`.
+    Everything is in the model's local frame, world coordinates minus `world_offset`, on numpy arrays.
     """
 
     @property
@@ -34,7 +34,7 @@ class Renderable(Protocol):
         ...
 
     @property
-    def bounds(self) -> tuple[Tensor, Tensor]:
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Spheres that hold all that is drawn of a unit (anchor, splat): centres [N, 3] and radii [N], world units."""
         ...
 
@@ -57,11 +57,11 @@ class Renderable(Protocol):
         """The same over another background."""
         ...
 
-    def gaussians(self, camera: Camera, visible: Tensor | None = None) -> Gaussians:
+    def gaussians(self, camera: Camera, visible: np.ndarray | None = None) -> Gaussians[np.ndarray]:
         """What a camera sees of the units of a mask [N] bool, or of all."""
         ...
 
-    def parts(self, camera: Camera, visible: Tensor | None = None) -> Iterator[Gaussians]:
+    def parts(self, camera: Camera, visible: np.ndarray | None = None) -> Iterator[Gaussians[np.ndarray]]:
         """The same, a part at a time, so that not all need be in memory; one part at least."""
         ...
 
@@ -78,17 +78,29 @@ def _moved(camera: Camera, offset: tuple[float, float, float]) -> Camera:
 
 
 @runtime_checkable
+class DrawsItself(Protocol):
+    """A scene that lives on another device than the CPU, and is drawn there; what it gives are numpy arrays."""
+
+    def draw(self, camera: Camera, settings: RasterSettings) -> RasterResult[np.ndarray]:
+        """What a camera of the model's frame sees."""
+        ...
+
+    def blended(self, gaussians: Gaussians[np.ndarray], camera: Camera, settings: RasterSettings) -> Blended:
+        """The image of Gaussians, which need not be the scene's own, with its gradients."""
+        ...
+
+
+@runtime_checkable
 class Trained(Protocol):
     """What training gives: it can be rendered as what a decoder would make of it."""
 
     def as_hybrid_model(self) -> Renderable: ...
 
 
-@torch.no_grad()
 def render(
     model: Renderable | Trained, camera: Camera, settings: RasterSettings | None = None
-) -> RasterResult:
-    """One view of a scene, without gradients, from a camera of the world. By default over the model's own background.
+) -> RasterResult[np.ndarray]:
+    """One view of a scene, from a camera of the world, as numpy arrays. By default over the model's own background.
 
     A trained model is quantized anew for each view; for many views, render its `as_hybrid_model()`. Raises ConfigError
     for what is no model.
@@ -101,6 +113,13 @@ def render(
         )
     camera = local_camera(model, camera)
     settings = settings or RasterSettings(background=model.background)
+    if isinstance(model, DrawsItself):
+        return model.draw(camera, settings)
     centers, radii = model.bounds
     visible = visible_mask(centers, radii, camera, settings)
     return rasterize_parts(model.parts(camera, visible), model.most_gaussians, camera, settings)
+
+
+def blend_of(model: Renderable) -> Blend:
+    """The function that draws Gaussians, with gradients, where the model is drawn."""
+    return model.blended if isinstance(model, DrawsItself) else blended

@@ -1,15 +1,16 @@
 """What rasterization gives back."""
 
 from dataclasses import dataclass
+from typing import Generic
 
-from torch import Tensor
+from compgs.gaussians import Array
 
 
 @dataclass(frozen=True, eq=False)
-class RasterResult:
-    """One rendered view of M Gaussians."""
+class RasterResult(Generic[Array]):
+    """One rendered view of M Gaussians, in float32; of tensors, with gradients where they have them."""
 
-    image: Tensor  # [H, W, 3] RGB over the background; not clamped
-    transmittance: Tensor  # [H, W] share of the background that shines through
-    means2d: Tensor  # [M, 2] pixels, in the autograd graph; zeros where a Gaussian is not drawn
-    visible: Tensor  # [M] bool: its box of pixels with alpha above the cutoff meets the image
+    image: Array  # [H, W, 3] RGB over the background; not clamped
+    transmittance: Array  # [H, W] share of the background that shines through
+    means2d: Array  # [M, 2] pixels; zeros where a Gaussian is not drawn
+    visible: Array  # [M] bool: its box of pixels with alpha above the cutoff meets the image

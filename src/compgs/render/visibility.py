@@ -11,13 +11,10 @@ It holds for splats as they are drawn, by the first-order projection, which can 
 ellipsoid.
 """
 
-import functools
 import math
 
 import numpy as np
-import torch
 from numba import prange
-from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.numerics.compiled import njit
@@ -27,31 +24,18 @@ BLOCK = 4096  # anchors
 ROUNDING = 1e-5  # of the lengths involved: float32 must not lose what lies on the boundary
 
 
-@torch.no_grad()
 def visible_mask(
-    positions: Tensor,  # [N, 3] world units
-    radii: Tensor,  # [N] world units, of spheres that hold all that is drawn of an anchor
+    positions: np.ndarray,  # [N, 3] float32, world units
+    radii: np.ndarray,  # [N] float32, world units, of spheres that hold all that is drawn of an anchor
     camera: Camera,
     settings: RasterSettings,
-) -> Tensor:  # [N] bool
+) -> np.ndarray:  # [N] bool
     """False only where nothing of an anchor can reach a pixel."""
-    if positions.device.type == "cpu" and positions.dtype == radii.dtype == torch.float32:
-        mask = torch.empty(len(positions), dtype=torch.bool)
-        meet_frustum(
-            positions.detach().contiguous().numpy(),
-            radii.detach().contiguous().numpy(),
-            frustum(camera, settings).astype(np.float32),
-            mask.numpy(),
-        )
-        return mask
-    normals = frustum_on(camera, settings, positions.dtype, positions.device)
-    return (positions @ normals[:, :3].T + normals[:, 3] >= -radii[:, None] * normals[:, 4]).all(1)
-
-
-@functools.lru_cache(maxsize=4096)
-def frustum_on(camera: Camera, settings: RasterSettings, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`frustum` on a device; kept, as a copy to a GPU waits for it to finish its work."""
-    return torch.as_tensor(frustum(camera, settings), dtype=dtype, device=device)
+    mask = np.empty(len(positions), np.bool_)
+    # Writable: kernels would be compiled anew for arrays that are read-only.
+    positions, radii = (np.require(a, np.float32, ("C", "W")) for a in (positions, radii))
+    meet_frustum(positions, radii, frustum(camera, settings).astype(np.float32), mask)
+    return mask
 
 
 def frustum(camera: Camera, settings: RasterSettings) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError
-from compgs.scene.capture import Capture, PosedImage, check_camera
+from compgs.scene.capture import Capture, PosedImage, check_camera, check_inside
 from compgs.scene.images import image_size
 from compgs.scene.transforms import IMAGE_SUFFIXES, file_path, number, read_transforms, world_to_camera
 from compgs.scene.views import Points
@@ -36,6 +36,9 @@ def _read_split(folder: Path, file: Path) -> tuple[PosedImage, ...]:
     for index, frame in enumerate(values["frames"]):
         place = f"{file}, frame {index}"
         relative = file_path(frame, place)
+        check_inside(
+            folder / relative, (folder,), f"the image of frame {index} in {file.name}, {relative!r},"
+        )
         path = _with_suffix(folder / relative)
         # the file does not say the size; a missing image is reported with all others, later
         width, height = image_size(path) if path.is_file() else (1, 1)

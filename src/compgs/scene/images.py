@@ -23,6 +23,9 @@ from compgs.scene.views import View
 # is a program, and others of which a decoder is an unneeded risk. (MPO: JPEG of cameras that store several images.)
 FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA", "JPEG2000", "AVIF")
 
+# Of HEIF files whose pictures are HEVC; Pillow has no decoder for them.
+HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+
 # What Pillow raises for damaged files, besides OSError
 DAMAGED = (OSError, ValueError, SyntaxError, EOFError, IndexError, MemoryError, Image.DecompressionBombError)
 
@@ -268,7 +271,22 @@ def _more(count: int, what: str) -> str:
     return f" ({count} more {'is' if count == 1 else 'are'} {what})" if count else ""
 
 
+def is_heic(file: Path) -> bool:
+    """Whether a file is a photograph as iPhones store it, whatever it is called."""
+    try:
+        with file.open("rb") as content:
+            head = content.read(12)
+    except OSError:
+        return False
+    return head[4:8] == b"ftyp" and head[8:] in HEIC_BRANDS
+
+
 def _reason(file: Path, error: BaseException) -> str:
+    if is_heic(file):
+        return (
+            f"{file}: HEIC images are not read; convert all of them to JPEG, as with heif-convert, and name those "
+            "files in the poses"
+        )
     if isinstance(error, Image.DecompressionBombError):
         return f"{file}: the image is too large ({error}); give smaller copies of all images"
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)

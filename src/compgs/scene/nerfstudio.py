@@ -37,6 +37,9 @@ def read_nerfstudio(folder: Path) -> Capture:
     for index, frame in enumerate(values["frames"]):
         place = f"{file}, frame {index}"
         relative = file_path(frame, place)
+        check_inside(
+            folder / relative, (folder,), f"the image of frame {index} in {file.name}, {relative!r},"
+        )
         image = _posed_image(relative, folder / relative, {**shared, **frame}, place)
         posed.append(replace(image, mask=_mask(folder, frame, place)))
     if not posed:

@@ -41,13 +41,15 @@ def read_ply_points(file: Path) -> Points:
         else:
             vertices = np.frombuffer(body, np.dtype([(n, order + t) for n, t in columns]), count)
             rows = {name: vertices[name] for name, _ in columns}
-        positions = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    except (ValueError, KeyError) as error:
+        with np.errstate(invalid="ignore"):  # what is no number is left out below
+            positions = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    except (ValueError, KeyError, IndexError) as error:
         raise SceneError(
             f"{file}: vertices with x, y, z were expected ({error}); export them again"
         ) from error
     if all(name in rows for name in ("red", "green", "blue")):
-        colors = np.stack([rows[name] for name in ("red", "green", "blue")], axis=1).astype(np.uint8)
+        values = np.stack([rows[name] for name in ("red", "green", "blue")], axis=1).astype(np.float64)
+        colors = np.clip(np.nan_to_num(values), 0, 255).astype(np.uint8)
     else:
         colors = np.full((count, 3), _GRAY, dtype=np.uint8)
     finite = usable_positions(positions)

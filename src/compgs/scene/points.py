@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from compgs.cameras import Camera
 from compgs.errors import ConfigError
+from compgs.numerics.nearest import nearest
 from compgs.scene.views import Points
 
 MIN_POINTS = 100  # with fewer, structure from motion says too little of the scene to start from
@@ -42,12 +42,11 @@ def voxel_grid(points: Points, voxel_size: float | None = None) -> tuple[np.ndar
 def colors_at(points: Points, positions: np.ndarray) -> np.ndarray:
     """[N, 3] display RGB in 0 to 1: at positions [N, 3], the mean of the nearest points' colors by inverse distance."""
     neighbours = min(COLOR_NEIGHBOURS, len(points))
-    distances, nearest = cKDTree(points.positions).query(positions, k=neighbours)
-    distances, nearest = (a.reshape(len(positions), neighbours) for a in (distances, nearest))
+    distances, found = nearest(points.positions, positions, neighbours)
     # A point that is met exactly counts much, not infinitely, also where all points are in one place.
     weights = 1.0 / np.maximum(distances + 1e-3 * distances.mean(), np.finfo(np.float32).tiny)
     weights /= weights.sum(1, keepdims=True)
-    return (points.colors[nearest] / 255.0 * weights[..., None]).sum(1)
+    return (points.colors[found] / 255.0 * weights[..., None]).sum(1)
 
 
 def median_spacing(positions: np.ndarray) -> float:  # positions: [P, 3] world units
@@ -58,7 +57,7 @@ def median_spacing(positions: np.ndarray) -> float:  # positions: [P, 3] world u
     unique = np.unique(positions, axis=0)
     if len(unique) < 2:
         return 1.0
-    distances, _ = cKDTree(unique).query(unique, k=2)
+    distances, _ = nearest(unique, unique, 2)
     return float(np.median(distances[:, 1]))
 
 

@@ -1,5 +1,6 @@
 """Training: the loop, adaptive control, optimizer, checkpoints (CompGS Sec. 3.4); plain 3DGS to compare with."""
 
+from compgs.training.history import History
 from compgs.training.hooks import Drawn, Hooks
 from compgs.training.loop import Run, TrainingStatus
 from compgs.training.phases import Phase, fine_tuning, train_phases
@@ -10,6 +11,7 @@ from compgs.training.trainer import Trainer, train, train_hybrid
 
 __all__ = [
     "Drawn",
+    "History",
     "Hooks",
     "Phase",
     "Run",

@@ -19,9 +19,19 @@ from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
 from compgs.errors import CheckpointError, OutputError
 from compgs.outputs import replacing
+from compgs.scene.capture import check_camera
+from compgs.scene.points import COORDINATE_BITS
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
 from compgs.training.decorrelation import keep_channels
+from compgs.training.restoring import (
+    check_moments,
+    check_step,
+    check_tensor,
+    check_tensors,
+    finite,
+    restoring,
+)
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 CHECKPOINT_VERSION = "2"
@@ -79,23 +89,42 @@ def write_checkpoint_file(
 def load_checkpoint(path: Path) -> Checkpoint:
     """Raises CheckpointError if there is none, or it is damaged, of another version or of another method."""
     tensors, metadata = read_checkpoint_file(path, "compgs")
-    config = config_from_dict(json.loads(metadata["config"]), str(path))
-    scene = json.loads(metadata["scene"])
-    parts = tensors_by_kind(tensors)
-    model = TrainedModel(
-        config,
-        parts["model"]["coordinates"],
-        scene["voxel_size"],
-        scene["distance_unit"],
-        tuple(scene["background"]),
-        tuple(scene["world_offset"]),
-    )
+    with restoring(path):
+        config = config_from_dict(json.loads(metadata["config"]), str(path))
+        parts = tensors_by_kind(tensors)
+        model = _model(config, json.loads(metadata["scene"]), parts["model"])
+        check_moments(parts["optimizer"], dict(model.named_parameters()))
+        state = json.loads(metadata["state"])
+        check_step(state, config.training.steps)
+        return Checkpoint(model, parts["optimizer"], parts["extra"], state)
+
+
+def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) -> TrainedModel:
+    """Raises ValueError and the like for what does not belong together."""
+    coordinates, references = tensors["coordinates"], tensors["references"]
+    anchors = len(coordinates)
+    check_tensor(coordinates, (anchors, 3), torch.int32, "coordinates")
+    if anchors == 0 or coordinates.abs().max() >= 1 << (COORDINATE_BITS - 1):
+        raise ValueError(f"{anchors} anchors, expected some, at coordinates of {COORDINATE_BITS} bits")
+    # Of as many anchors as there are coordinates, before as much memory is taken.
+    for name, columns in (("log_scales", 6), ("mask", config.model.coupled_primitives)):
+        if tensors[name].shape != (anchors, columns):
+            raise ValueError(f"{name}: expected {[anchors, columns]}, found {list(tensors[name].shape)}")
+    if references.shape != (anchors, references.shape[-1]) or not (
+        1 <= references.shape[1] <= config.model.reference_dim
+    ):
+        raise ValueError(f"references: {list(references.shape)} of {anchors} anchors")
+    (voxel_size, distance_unit) = finite([scene["voxel_size"], scene["distance_unit"]], 2, "units", above=0.0)
+    red, green, blue = finite(scene["background"], 3, "background")
+    x, y, z = finite(scene["world_offset"], 3, "world_offset")
+    model = TrainedModel(config, coordinates, voxel_size, distance_unit, (red, green, blue), (x, y, z))
     model.viewpoints = tuple(_camera(entry) for entry in scene["viewpoints"])
-    model.up = tuple(scene["up"])
-    channels = parts["model"]["references"].shape[1]
-    keep_channels(model, torch.arange(model.reference_dim) < channels)
-    model.load_state_dict(parts["model"])
-    return Checkpoint(model, parts["optimizer"], parts["extra"], json.loads(metadata["state"]))
+    up_x, up_y, up_z = finite(scene["up"], 3, "up")
+    model.up = (up_x, up_y, up_z)
+    keep_channels(model, torch.arange(model.reference_dim) < references.shape[1])
+    check_tensors(tensors, model.state_dict(), "model")
+    model.load_state_dict(tensors)
+    return model
 
 
 def _camera_entry(camera: Camera) -> dict[str, Any]:
@@ -103,7 +132,11 @@ def _camera_entry(camera: Camera) -> dict[str, Any]:
 
 
 def _camera(entry: dict[str, Any]) -> Camera:
-    return Camera(**{**entry, "world_to_camera": np.array(entry["world_to_camera"], np.float64)})
+    camera = Camera(**{**entry, "world_to_camera": np.array(entry["world_to_camera"], np.float64)})
+    if camera.world_to_camera.shape != (4, 4):
+        raise ValueError(f"a camera's pose of {list(camera.world_to_camera.shape)} numbers, expected 4 x 4")
+    check_camera(camera, "a camera that the file would keep")
+    return camera
 
 
 def read_checkpoint_file(path: Path, method: str) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -113,8 +146,10 @@ def read_checkpoint_file(path: Path, method: str) -> tuple[dict[str, Tensor], di
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, safetensors.SafetensorError) as error:
+            # Copies: on Windows a file that is mapped could not be replaced by the run's next checkpoint.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+    # (the last three: of tensors that the header describes in a way that torch cannot have)
+    except (OSError, safetensors.SafetensorError, ValueError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
     if metadata.get("format") != "compgs checkpoint" or metadata.get("version") != CHECKPOINT_VERSION:
         raise CheckpointError(f"{path}: not a checkpoint of this version ({CHECKPOINT_VERSION}); train anew")
@@ -128,7 +163,7 @@ def tensors_by_kind(tensors: dict[str, Tensor]) -> dict[str, dict[str, Tensor]]:
     """`model/...`, `optimizer/...` and `extra/...`, each without the first part of the name."""
     parts: dict[str, dict[str, Tensor]] = {"model": {}, "optimizer": {}, "extra": {}}
     for name, value in tensors.items():
-        kind, rest = name.split("/", 1)
+        kind, _, rest = name.partition("/")
         parts[kind][rest] = value
     return parts
 

@@ -22,7 +22,7 @@ from torch import Tensor
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
 from compgs.entropy.models import starting_residuals
-from compgs.model.prediction import Prediction
+from compgs.tensors.prediction import Prediction
 from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import replace_rows
 

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.numerics.linear import transposed_product
+from compgs.tensors.linear import transposed_product
 from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import replace_parameter
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import SplatConfig
-from compgs.model.splats import Splats
+from compgs.tensors.splats import Splats
 
 PUBLISHED_START, PUBLISHED_EVERY, PUBLISHED_RESET = 500, 100, 3_000  # steps
 RECOVERY_PASSES = 5  # over the views

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from compgs.gaussians import Gaussians
-from compgs.model.prediction import Prediction
+from compgs.tensors.prediction import Prediction
 
 FEW_VIEWS = 15  # and fewer are few; twice as many are not any more
 HIGHEST_OPACITY = 0.9999  # of those that make up for the others

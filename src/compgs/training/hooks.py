@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.losses import Target
-from compgs.model.splats import Splats
 from compgs.render import RasterResult
+from compgs.tensors.splats import Splats
 
 if TYPE_CHECKING:
     from compgs.training.splat_trainer import SplatTrainer

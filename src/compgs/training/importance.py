@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from compgs.cameras import Camera
-from compgs.model.prediction import Prediction
-from compgs.render import RasterSettings, contributions
+from compgs.render import RasterSettings
 from compgs.scene.views import View
+from compgs.tensors.contributions import contributions
+from compgs.tensors.prediction import Prediction
 
 # Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
 # up for an error. All views decide what the file leaves out at the end, since a primitive may matter to one alone.

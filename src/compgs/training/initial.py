@@ -2,10 +2,10 @@
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from compgs.config import MAX_VIEWPOINTS, Config
 from compgs.errors import ConfigError
+from compgs.numerics.nearest import nearest
 from compgs.scene.points import colors_at, median_spacing, voxel_grid
 from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Scene
@@ -41,7 +41,7 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
             config, torch.from_numpy(coordinates), voxel_size, scene.extent, scene.background, offset
         )
     neighbours = min(4, len(coordinates))
-    distances = cKDTree(coordinates).query(coordinates, k=neighbours)[0].reshape(len(coordinates), neighbours)
+    distances, _ = nearest(coordinates, coordinates, neighbours)
     spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(1)
     with torch.no_grad():
         model.log_scales.copy_(

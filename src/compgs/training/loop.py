@@ -15,8 +15,9 @@ from compgs.config import Config, TrainingConfig, check_config, load_config
 from compgs.errors import ConfigError, TrainingError
 from compgs.gaussians import Gaussians
 from compgs.interrupt import held_back
-from compgs.losses import Target
-from compgs.render import RasterResult, RasterSettings, rasterize
+from compgs.losses import Target, exposed
+from compgs.render import RasterResult, RasterSettings, Renderable
+from compgs.tensors.rasterize import rasterize
 from compgs.training.allocation import freed_memory_kept
 from compgs.training.checkpoint import CHECKPOINT_NAME
 from compgs.training.profile import StepProfile
@@ -61,6 +62,7 @@ class Run:
         on_progress: Callable[[TrainingStatus], None] | None = None,
         device: str | torch.device | None = None,  # None: CUDA where there is one
         profile: StepProfile | None = None,
+        watch: "Watch | None" = None,
     ) -> None:
         """Raises ConfigError if there is no folder to resume from."""
         if output is None and resume:
@@ -71,6 +73,7 @@ class Run:
         self.on_progress = on_progress
         self.device = chosen_device(device)
         self.profile = profile
+        self.watch = watch
 
     @property
     def earlier(self) -> Path | None:
@@ -96,9 +99,17 @@ class Trains(Protocol):
 
     def estimated_bytes(self) -> int: ...
 
+    def snapshot(self) -> Renderable:
+        """The scene of now, to be rendered: a copy that further steps do not change, taken without any chance."""
+        ...
+
     def finish(self) -> None: ...
 
     def save(self, path: Path) -> None: ...
+
+
+# Called between any two steps, for whoever wants to look at the scene as it grows.
+Watch = Callable[[Trains], None]
 
 
 def rasterize_step(
@@ -205,9 +216,10 @@ def run_to_end(
     config: TrainingConfig,
     path: Path | None,
     on_progress: Callable[[TrainingStatus], None] | None,
+    watch: Watch | None = None,
 ) -> None:
     """All remaining steps; checkpoints at `path` as `Saving` says. Progress is reported now and then, and right after
-    each checkpoint."""
+    each checkpoint. What `watch` does takes its time, and changes nothing."""
     saving, pace, estimate = Saving(trainer, path, config.checkpoint_minutes), Pace(), 0
     try:
         while trainer.step < config.steps:
@@ -226,6 +238,8 @@ def run_to_end(
                 if trainer.step % ESTIMATE_EVERY == 0 or not estimate:
                     estimate = trainer.estimated_bytes()
                 on_progress(_status(trainer, config.steps, result, estimate, seconds))
+            if watch:
+                watch(trainer)
         trainer.finish()
     except KeyboardInterrupt:
         saving.stopped()
@@ -234,8 +248,10 @@ def run_to_end(
 
 
 def _status(trainer: Trains, steps: int, result: StepResult, estimate: int, pace: float) -> TrainingStatus:
-    photograph = result.photograph.image.to(result.image.dtype) / 255.0
-    error = float(((result.image.clamp(0, 1) - photograph) ** 2).mean())
+    photograph, counted = result.photograph.image.to(result.image.dtype) / 255.0, result.photograph.counted
+    image = exposed(result.image, result.photograph.exposure).detach()
+    squares = (image.clamp(0, 1) - photograph) ** 2
+    error = float((squares if counted is None else squares[counted]).mean())
     psnr = -10.0 * float(np.log10(max(error, 1e-10)))
     return TrainingStatus(
         step=trainer.step,

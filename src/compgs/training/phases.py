@@ -13,6 +13,7 @@ from compgs.scene.views import Scene
 from compgs.training.checkpoint import read_checkpoint_file
 from compgs.training.hooks import Hooks
 from compgs.training.loop import Run, TrainingStatus
+from compgs.training.restoring import restoring
 from compgs.training.splat_trainer import PARTS, SplatTrainer, stations
 
 
@@ -42,7 +43,7 @@ def train_phases(
     Raises CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
     """
     total = sum(phase.config.training.steps for phase in phases)
-    number = _phase_of(run)
+    number = _phase_of(run, len(phases))
     trainer = None
     for index in range(number, len(phases)):
         phase = phases[index]
@@ -67,17 +68,21 @@ def train_phases(
         if run.profile is not None:
             run.profile.watch(trainer, PARTS, stations)
         before = sum(phase.config.training.steps for phase in phases[:index])
-        trainer.run(run.checkpoint, _of_whole(run.on_progress, before, total))
+        trainer.run(run.checkpoint, _of_whole(run.on_progress, before, total), run.watch)
     assert trainer is not None
     return trainer
 
 
-def _phase_of(run: Run) -> int:
+def _phase_of(run: Run, phases: int) -> int:
     """In which the run to be continued was; 0 for a new one."""
     if run.earlier is None:
         return 0
     _, metadata = read_checkpoint_file(run.earlier, run.method)
-    return int(json.loads(metadata["state"]).get("phase", 0))
+    with restoring(run.earlier):
+        phase = json.loads(metadata["state"]).get("phase", 0)
+        if phase not in range(phases):
+            raise ValueError(f"phase {phase!r} of {phases}")
+        return int(phase)
 
 
 def _of_whole(

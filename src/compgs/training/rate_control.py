@@ -11,6 +11,7 @@ went on integrating would run away for nothing.
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 LOWEST, HIGHEST = 1e-6, 1.0  # of lambda; below, growth does not follow it any more (control.LAMBDA_RANGE)
 LOOKS = 100  # estimates of the size in a run; each costs about as much as a training step
@@ -30,6 +31,14 @@ class RateState:
     lmbda: float
     error: float | None = None  # log(size / target) at the last estimate after growth; None before the first
     share: float = 1.0  # of the present bytes that later pruning will leave
+
+    @staticmethod
+    def restored(values: dict[str, Any]) -> "RateState":
+        """Of a checkpoint. Raises ValueError, TypeError for what is no state."""
+        state = RateState(**values)
+        if not all(math.isfinite(number) for number in (state.lmbda, state.error or 0.0, state.share)):
+            raise ValueError(f"the state of lambda is not finite: {values}")
+        return state
 
 
 def due(step: int, steps: int, rate_start: float) -> bool:

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from compgs.config import SplatConfig
-from compgs.model.spherical_harmonics import coefficients, dc_from_color
-from compgs.model.splats import Splats
+from compgs.numerics.nearest import nearest
 from compgs.scene.views import Points
+from compgs.tensors.spherical_harmonics import coefficients, dc_from_color
+from compgs.tensors.splats import Splats
 from compgs.training.optimizers import ADAM_EPSILON, replace_parameter
 
 NEIGHBOURS = 3  # of a point: their mean distance is the size of its splat
@@ -46,7 +46,7 @@ def initial_splats(points: Points, config: SplatConfig) -> Splats:
     """Every point becomes a round splat of its color, as large as the distance to its neighbours."""
     n = len(points)
     neighbours = min(NEIGHBOURS + 1, n)
-    distances = cKDTree(points.positions).query(points.positions, k=neighbours)[0].reshape(n, neighbours)
+    distances, _ = nearest(points.positions, points.positions, neighbours)
     spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(n)
     spread = np.maximum(spread, SMALLEST_SCALE)
     opacity = torch.full((n,), config.initial_opacity)

@@ -15,13 +15,16 @@ from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
+from compgs.devices import placed
 from compgs.gaussians import Gaussians
 from compgs.losses import photometric_loss
-from compgs.model.splats import SplatModel, Splats, splat_gaussians, splat_radii
-from compgs.render import RasterResult, RasterSettings, visible_mask
+from compgs.model.splats import SplatModel
+from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
+from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
+from compgs.tensors.visibility import visible_mask
 from compgs.training.checkpoint import (
     check_same_run,
     optimizer_tensors,
@@ -36,12 +39,22 @@ from compgs.training.loop import (
     Run,
     StepResult,
     TrainingStatus,
+    Watch,
     chosen_config,
     rasterize_step,
     run_to_end,
 )
 from compgs.training.optimizers import exponential_decay, set_learning_rates
 from compgs.training.profile import StepProfile
+from compgs.training.restoring import (
+    check_moments,
+    check_step,
+    check_tensor,
+    finite,
+    restore_chance,
+    restore_statistics,
+    restoring,
+)
 from compgs.training.seen_points import check_points_seen
 from compgs.training.splat_parameters import (
     SplatParameters,
@@ -101,7 +114,7 @@ class SplatTrainer:
         phase: int = 0,  # of the run, and the method whose run it is: checkpoints say them
         method: str = METHOD,
     ) -> None:
-        self.views = ViewsInTurn(scene, device, config.training.seed + 2)
+        self.views = ViewsInTurn(scene, device, config.training.seed + 2, exposure=config.training.exposure)
         self.world_offset = world_offset(scene) if start is None else start.world_offset
         scene = self.scene = local_scene(scene, self.world_offset)
         self.config = config
@@ -112,7 +125,7 @@ class SplatTrainer:
         splats = (
             initial_splats(scene.points, config.splats)
             if start is None
-            else of_degree(start.splats, config.splats.harmonics)
+            else of_degree(Splats.of(start.splats), config.splats.harmonics)
         )
         self.parameters = SplatParameters(splats.to(device))
         self.optimizer = make_splat_optimizer(self.parameters, config.splats, scene.extent)
@@ -197,6 +210,7 @@ class SplatTrainer:
         set_learning_rates(self.optimizer, self.progress, exponential_decay)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
+        self.views.learn(self.progress)
 
     def observe(self, rendered: RasterResult, camera: Camera) -> None:
         if self.schedule.active(self.step) and rendered.means2d.grad is not None:
@@ -235,10 +249,15 @@ class SplatTrainer:
 
     # the run -------------------------------------------------------------------------------------------------------
 
-    def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
+    def run(
+        self,
+        path: Path | None,
+        on_progress: Callable[[TrainingStatus], None] | None,
+        watch: Watch | None = None,
+    ) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         check_points_seen(self.scene, self.settings.near_plane)
-        run_to_end(self, self.config.training, path, on_progress)
+        run_to_end(self, self.config.training, path, on_progress, watch)
 
     def estimated_bytes(self) -> int:
         """Size of the method's file if it were written now; of a .ply file without its header."""
@@ -251,9 +270,14 @@ class SplatTrainer:
         """Plain 3DGS has nothing left to do: the file holds the splats as they are."""
         self.hooks.finish(self)
 
+    def snapshot(self) -> SplatModel:
+        """Before any `transform`, for which a hook may draw random numbers."""
+        return self.model()
+
     def model(self) -> SplatModel:
         """The splats of now, before any `transform`."""
-        return SplatModel(self.parameters.trained(), self.scene.background, self.world_offset)
+        arrays = self.parameters.trained().arrays(self.world_offset)
+        return placed(SplatModel(arrays, self.scene.background), self.device)
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
@@ -263,6 +287,7 @@ class SplatTrainer:
         tensors |= {f"optimizer/{name}": value for name, value in moments.items()}
         tensors |= {f"extra/control/{n}": getattr(self.control, n) for n in DensityControl.STATISTICS}
         tensors |= {f"extra/{HOOKS}{name}": value for name, value in hook_state(self.hooks).items()}
+        tensors |= {f"extra/{name}": value for name, value in self.views.tensors().items()}
         tensors["extra/chance"] = self.chance.get_state()
         state = {
             "step": self.step,
@@ -292,24 +317,38 @@ class SplatTrainer:
     ) -> "SplatTrainer":
         """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
         tensors, metadata = read_checkpoint_file(path, method)
-        state = json.loads(metadata["state"])
-        saved = config_from_dict(json.loads(metadata["config"]), str(path), type(config))
-        check_same_run(saved, config, state["views"], scene)
-        parts = tensors_by_kind(tensors)
-        offset = tuple(state.get("world_offset", (0.0, 0.0, 0.0)))  # older checkpoints have none
-        start = SplatModel(Splats(**parts["model"]), scene.background, offset)
+        with restoring(path):
+            state = json.loads(metadata["state"])
+            saved = config_from_dict(json.loads(metadata["config"]), str(path), type(config))
+            check_same_run(saved, config, state["views"], scene)
+            check_step(state, config.training.steps)
+            parts = tensors_by_kind(tensors)
+            x, y, z = finite(state.get("world_offset", [0.0] * 3), 3, "world_offset")  # older ones have none
+            start = SplatModel(checked_splats(parts["model"]).arrays((x, y, z)), scene.background)
         trainer = cls(scene, config, device, start, hooks, phase=phase, method=method)
-        extra = parts["extra"]
-        own = {name.removeprefix(HOOKS): value for name, value in extra.items() if name.startswith(HOOKS)}
-        restore_hooks(trainer.hooks, own)
-        trainer.train_hooks()
-        restore_optimizer(trainer.named_parameters(), trainer.optimizer, parts["optimizer"])
-        for name in DensityControl.STATISTICS:
-            setattr(trainer.control, name, extra[f"control/{name}"].to(device))
-        trainer.chance.set_state(extra["chance"])
-        trainer.views.restore(state)
-        trainer.step = state["step"]
+        with restoring(path):
+            extra = parts["extra"]
+            own = {name.removeprefix(HOOKS): v for name, v in extra.items() if name.startswith(HOOKS)}
+            restore_hooks(trainer.hooks, own)
+            trainer.train_hooks()
+            check_moments(parts["optimizer"], trainer.named_parameters())
+            restore_optimizer(trainer.named_parameters(), trainer.optimizer, parts["optimizer"])
+            restore_statistics(trainer.control, DensityControl.STATISTICS, extra)
+            restore_chance(trainer.chance, extra)
+            trainer.views.restore(state, extra)
+            trainer.step = state["step"]
         return trainer
+
+
+def checked_splats(tensors: dict[str, Tensor]) -> Splats:
+    """Of a checkpoint. Raises ValueError and the like for what does not belong together."""
+    count, harmonics = len(tensors["means"]), tensors["rest"].shape[1]
+    shapes = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_logits": (), "dc": (3,)}
+    for name, shape in {**shapes, "rest": (harmonics, 3)}.items():
+        check_tensor(tensors[name], (count, *shape), torch.float32, name)
+    if harmonics + 1 not in (1, 4, 9, 16):
+        raise ValueError(f"{harmonics} harmonics are those of no degree")
+    return Splats(**tensors)
 
 
 # What a profile calls the parts of a step.

@@ -23,11 +23,13 @@ from compgs.losses import (
     scale_regularizer,
     scale_unit,
 )
-from compgs.model.prediction import Prediction, camera_center, choosing_pays, predict
-from compgs.render import RasterResult, RasterSettings, visible_mask
+from compgs.model.hybrid_model import HybridModel
+from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
+from compgs.tensors.prediction import Prediction, camera_center, choosing_pays, predict
+from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
 from compgs.training.checkpoint import (
     Checkpoint,
@@ -48,6 +50,7 @@ from compgs.training.loop import (
     Run,
     StepResult,
     TrainingStatus,
+    Watch,
     chosen_config,
     diverged,
     rasterize_step,
@@ -56,6 +59,7 @@ from compgs.training.loop import (
 from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rates, step_rows
 from compgs.training.profile import StepProfile
 from compgs.training.rate_control import RateState
+from compgs.training.restoring import check_tensor, restore_chance, restore_statistics, restoring
 from compgs.training.seen_points import check_points_seen
 from compgs.training.target_size import TargetSize, pruned_share
 from compgs.training.views_in_turn import ViewsInTurn
@@ -98,7 +102,7 @@ def train_hybrid(scene: Scene, config: Config, run: Run) -> TrainedModel:
         trainer = Trainer(scene, config, run.device)
     if run.profile is not None:
         run.profile.watch(trainer, PARTS, stations)
-    trainer.run(run.checkpoint, run.on_progress)
+    trainer.run(run.checkpoint, run.on_progress, run.watch)
     return trainer.model
 
 
@@ -111,7 +115,7 @@ class Trainer:
         self, scene: Scene, config: Config, device: torch.device, model: TrainedModel | None = None
     ) -> None:
         t, views = config.training, len(scene.train_views)
-        self.views = ViewsInTurn(scene, device, t.seed + 2)
+        self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure)
         self.config = config
         self.device = device
         self.model = (model or initial_model(scene, config)).to(device)
@@ -256,6 +260,7 @@ class Trainer:
         if rates is not None:
             references.copy_(before.lerp_(references, rates))
         self.optimizer.zero_grad(set_to_none=True)
+        self.views.learn(self.progress)
 
     def observe(self, rows: Tensor, prediction: Prediction, rendered: RasterResult, camera: Camera) -> None:
         """The statistics that growth and pruning go by."""
@@ -324,10 +329,19 @@ class Trainer:
 
     # the run -------------------------------------------------------------------------------------------------------
 
-    def run(self, path: Path | None, on_progress: Callable[[TrainingStatus], None] | None) -> None:
+    def run(
+        self,
+        path: Path | None,
+        on_progress: Callable[[TrainingStatus], None] | None,
+        watch: Watch | None = None,
+    ) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         check_points_seen(self.scene, self.settings.near_plane)
-        run_to_end(self, self.config.training, path, on_progress)
+        run_to_end(self, self.config.training, path, on_progress, watch)
+
+    def snapshot(self) -> HybridModel:
+        """What the file would hold of the scene now, but for primitives that the end of the run removes."""
+        return self.model.as_hybrid_model(stored_weights=self.stored)
 
     @property
     def primitives(self) -> int:
@@ -356,6 +370,7 @@ class Trainer:
     def save(self, path: Path) -> None:
         extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
         extra["chance"] = self.chance.get_state()
+        extra |= self.views.tensors()
         if self.reference_rates is not None:
             extra["reference_rates"] = self.reference_rates
         state = {
@@ -370,17 +385,20 @@ class Trainer:
     def resumed(cls, scene: Scene, path: Path, config: Config, device: torch.device) -> "Trainer":
         """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
         checkpoint = load_checkpoint(path)
-        check_same_run(checkpoint.model.config, config, checkpoint.state["views"], scene)
+        with restoring(path):
+            check_same_run(checkpoint.model.config, config, checkpoint.state["views"], scene)
         trainer = cls(scene, config, device, checkpoint.model)
-        restore_optimizer(dict(trainer.model.named_parameters()), trainer.optimizer, checkpoint.optimizer)
-        for name in AdaptiveControl.STATISTICS:
-            setattr(trainer.control, name, checkpoint.extra[f"control/{name}"].to(device))
-        if "reference_rates" in checkpoint.extra:
-            trainer.reference_rates = checkpoint.extra["reference_rates"].to(device)
-        trainer.chance.set_state(checkpoint.extra["chance"])
-        trainer.views.restore(checkpoint.state)
-        trainer.step = checkpoint.state["step"]
-        trainer.rate = RateState(**checkpoint.state["rate"])
+        with restoring(path):
+            restore_optimizer(dict(trainer.model.named_parameters()), trainer.optimizer, checkpoint.optimizer)
+            restore_statistics(trainer.control, AdaptiveControl.STATISTICS, checkpoint.extra)
+            if any(at < checkpoint.state["step"] for at in trainer.decorrelated_at):
+                rates = checkpoint.extra["reference_rates"]
+                check_tensor(rates, (trainer.model.reference_dim,), torch.float32, "reference_rates")
+                trainer.reference_rates = rates.to(device)
+            restore_chance(trainer.chance, checkpoint.extra)
+            trainer.views.restore(checkpoint.state, checkpoint.extra)
+            trainer.step = checkpoint.state["step"]
+            trainer.rate = RateState.restored(checkpoint.state["rate"])
         return trainer
 
 

@@ -1,5 +1,14 @@
-"""Scenes in a web page: a page that holds a file, its decoder and its viewer, and needs no server."""
+"""Scenes in a browser: pages that need no server (page, gallery), and a viewer that this process renders for (live)."""
 
+from compgs.errors import MissingDependency, install_line
 from compgs.viewer.page import html_page
 
-__all__ = ["html_page"]
+__all__ = ["check_viewer", "html_page"]
+
+
+def check_viewer() -> None:
+    """Raises MissingDependency, with the remedy, where no live viewer can be opened."""
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise MissingDependency(f"the viewer needs viser: {install_line('view')}") from error

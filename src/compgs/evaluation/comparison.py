@@ -1,0 +1,421 @@
+"""Two files of one scene beside each other: their bytes, and their pictures from the same cameras.
+
+`results.json` (one object):
+
+| key | unit, meaning |
+|---|---|
+| schema | "compgs comparison 1" |
+| compgs | version of the program that compared |
+| a, b | the files, see below |
+| scene | name of the scene whose photographs both were compared with, or null |
+| cameras | where the cameras come from, in words |
+| views, width, height | number of cameras; pixels of the first |
+| identical | every picture of b is equal to that of a |
+| psnr | dB, of b's pictures against a's, mean over the views; equal ones count as 100; null if all are |
+| ssim | of b's pictures against a's, mean over the views |
+| worst_view, worst_psnr | name of the view in which they differ most; its dB, null if identical |
+| device, threads | where it ran |
+| notes | what was decided, one sentence each |
+
+Of each file:
+
+| key | unit, meaning |
+|---|---|
+| file, format, bytes, sha256 | name, kind by its first bytes, size and hash |
+| components | bytes by component; they sum to `bytes` |
+| primitives | that are drawn: coupled primitives or splats |
+| anchors, coupled_primitives, splats | counts, null what the file does not have |
+| psnr, ssim | against the photographs, mean over the views; null without photographs |
+| decode_seconds, render_seconds | file to model, kernels loaded; median over the views |
+
+`per_view.json`: a list in the views' order with `name`, `file` (of the pictures in `a`, `b`, `difference` and `gt`),
+`psnr`, `ssim` (of b against a), `a_psnr`, `a_ssim`, `b_psnr`, `b_ssim` (against the photograph, or null) and
+`difference_scale`: levels, of 255, at which `difference` is white.
+"""
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean, median
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+
+from compgs import __version__, metrics
+from compgs.cameras import Camera
+from compgs.devices import chosen_device, device_name
+from compgs.errors import SceneError, UnsupportedCamera
+from compgs.evaluation.camera_path import camera_entry, read_cameras, surround
+from compgs.evaluation.measure import encode_png, timed_decode, timed_render
+from compgs.evaluation.reports.comparison_page import ComparisonPage
+from compgs.evaluation.reports.pictures import difference_picture, levels_between, scale_for
+from compgs.formats import check_scene, component_bytes, format_of
+from compgs.model.hybrid_model import HybridModel
+from compgs.model.splats import SplatModel
+from compgs.outputs import check_output_folder, filling, write_bytes, write_json
+from compgs.render import Renderable
+from compgs.scene import as_scene
+from compgs.scene.views import Scene, View
+
+if TYPE_CHECKING:
+    from compgs.devices import Device
+
+SCHEMA = "compgs comparison 1"
+PAGE_NAME = "comparison.html"
+AROUND_EVERY = 3  # of the cameras around a scene: 24 of 72
+LEAST_OWN = 2  # cameras that a file must keep for them to be enough to look from
+
+Background = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ComparedFile:
+    """One of the two files."""
+
+    file: str
+    format: str
+    bytes: int
+    sha256: str
+    components: dict[str, int]  # bytes
+    primitives: int
+    anchors: int | None
+    coupled_primitives: int | None
+    splats: int | None
+    psnr: float | None  # dB, against the photographs
+    ssim: float | None
+    decode_seconds: float
+    render_seconds: float
+
+
+@dataclass(frozen=True)
+class ComparedView:
+    """One camera."""
+
+    name: str
+    file: str  # of the pictures in a, b, difference and gt
+    psnr: float  # dB, of b's picture against a's; infinite if they are equal
+    ssim: float
+    a_psnr: float | None  # dB, against the photograph
+    a_ssim: float | None
+    b_psnr: float | None
+    b_ssim: float | None
+    difference_scale: int  # levels, of 255, at which the picture of the difference is white
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What two files are to each other, and to the photographs."""
+
+    compgs: str
+    a: ComparedFile
+    b: ComparedFile
+    scene: str | None
+    cameras: str  # where they come from
+    width: int  # pixels
+    height: int  # pixels
+    device: str
+    threads: int
+    notes: tuple[str, ...]
+    per_view: tuple[ComparedView, ...]
+
+    @property
+    def psnr(self) -> float:
+        """dB, of b against a; infinite if all pictures are equal (`metrics.mean_psnr`)."""
+        return metrics.mean_psnr([view.psnr for view in self.per_view])
+
+    @property
+    def ssim(self) -> float:
+        """Of b against a."""
+        return fmean(view.ssim for view in self.per_view)
+
+    @property
+    def identical(self) -> bool:
+        return math.isinf(self.psnr)
+
+    @property
+    def worst(self) -> ComparedView:
+        """The view in which b differs most from a."""
+        return min(self.per_view, key=lambda view: view.psnr)
+
+    def in_words(self) -> list[str]:
+        """What there is to say about two files, a sentence a line."""
+        of_views = (
+            f"{len(self.per_view)} {self.cameras}" if len(self.per_view) > 1 else f"1 of {self.cameras}"
+        )
+        size = f"{self.width} x {self.height} pixels"
+        if self.identical:
+            same = self.a.sha256 == self.b.sha256 and self.a.bytes == self.b.bytes
+            lines = ["The files are the same, byte for byte."] if same else []
+            return [*lines, f"Their pictures are identical, in {of_views} ({size})."]
+        equal = sum(view.psnr == float("inf") for view in self.per_view)
+        also = (
+            f" {equal} of the pictures are identical and count as {metrics.SAME_PICTURE:.0f} dB."
+            if equal
+            else ""
+        )
+        return [
+            f"{self.b.file} against {self.a.file}: PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}, mean of {of_views} "
+            f"({size}).{also}",
+            f"They differ most in {self.worst.name}: {self.worst.psnr:.2f} dB.",
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of `results.json`."""
+        return {
+            "schema": SCHEMA,
+            "compgs": self.compgs,
+            "a": dataclasses.asdict(self.a),
+            "b": dataclasses.asdict(self.b),
+            "scene": self.scene,
+            "cameras": self.cameras,
+            "views": len(self.per_view),
+            "width": self.width,
+            "height": self.height,
+            "identical": self.identical,
+            "psnr": self.psnr,
+            "ssim": self.ssim,
+            "worst_view": self.worst.name,
+            "worst_psnr": self.worst.psnr,
+            "device": self.device,
+            "threads": self.threads,
+            "notes": list(self.notes),
+        }
+
+    def per_view_list(self) -> list[dict[str, Any]]:
+        """The content of `per_view.json`."""
+        return [dataclasses.asdict(view) for view in self.per_view]
+
+
+def compare(
+    a: str | Path,
+    b: str | Path,
+    *,
+    scene: Scene | str | Path | None = None,
+    cameras: Sequence[tuple[str, Camera]] | str | Path | None = None,
+    background: Background | None = None,
+    output: str | Path | None = None,
+    overwrite: bool = False,
+    device: "Device | None" = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Comparison:
+    """Open two files of any known formats (`compgs.formats`) and compare what they show.
+
+    With a `scene` (or its folder, read as `load_scene(folder)` does) both are compared with its held-out photographs,
+    too. Else they are seen from `cameras` (names and cameras, or a camera file), else from those that a file keeps,
+    else from all around. Metrics are of 8-bit images (`compgs.metrics`).
+
+    `background`, RGB, 0 to 1: behind both; by default that of the scene, of a .cgs file, or black. With a scene, a
+    .cgs file keeps its own, as in an evaluation. With `output`, a folder, `results.json` and `per_view.json` (their
+    schema: `compgs.evaluation.comparison`), `cameras.json`, the pictures (`a`, `b`, `difference`, `gt`) and
+    `comparison.html` are written there. `progress(done, total)` is called after each view.
+
+    Raises BitstreamError, SplatFileError, SceneError, OutputError.
+    """
+    paths = Path(a), Path(b)
+    for path in paths:
+        check_scene(path)
+    if scene is not None and cameras is not None:
+        raise SceneError("a scene and cameras were both given; give one")
+    if output is not None:
+        check_output_folder(Path(output), overwrite=overwrite)
+    chosen = chosen_device(device)
+    read = None if scene is None else as_scene(scene)
+    sides, notes = _opened(paths, chosen, read, background)
+    places, origin = _places(sides, read, cameras)
+    if output is None:
+        return _compared(sides, places, origin, read, notes, chosen, progress)
+    with filling(Path(output)) as folder:
+        page = ComparisonPage(paths[0].name, paths[1].name)
+
+        def keep(row: ComparedView, pictures: dict[str, np.ndarray]) -> None:
+            for name, picture in pictures.items():
+                write_bytes(folder / name / row.file, encode_png(picture))
+            page.keep(row, pictures)
+
+        found = _compared(sides, places, origin, read, notes, chosen, progress, keep)
+        write_json(folder / "cameras.json", [camera_entry(place.camera, place.name) for place in places])
+        write_json(folder / "per_view.json", found.per_view_list())
+        write_json(folder / "results.json", found.to_dict())
+        write_bytes(folder / PAGE_NAME, page.html(found))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """A file that is open."""
+
+    path: Path
+    model: Renderable
+    decode_seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where both are looked at from."""
+
+    name: str
+    camera: Camera
+    view: View | None  # with a photograph
+
+
+def _opened(
+    paths: tuple[Path, Path], device: str, scene: Scene | None, background: Background | None
+) -> tuple[tuple[_Side, _Side], tuple[str, ...]]:
+    """Both files, over one background and in one place; and what was decided for that."""
+    behind = background or (scene.background if scene else (0.0, 0.0, 0.0))
+    opened = []
+    for path in paths:
+        timed_decode(path, device, behind)  # kernels are loaded: not what a file costs
+        opened.append(_Side(path, *timed_decode(path, device, behind)))
+    models, notes = [side.model for side in opened], []
+    own = [model.background for model in models if isinstance(model, HybridModel)]
+    if background is None and scene is None and own:
+        models, behind = [model.over(own[0]) for model in models], own[0]
+        if len(set(own)) > 1:
+            notes.append(f"backgrounds differ, {own[0]} and {own[1]}: both are shown over the first")
+    elif background is not None:
+        models = [model.over(background) for model in models]
+    for i, (model, other) in enumerate(zip(models, models[::-1], strict=True)):
+        if _counts_from_the_other(model, other):
+            assert isinstance(model, SplatModel)
+            models[i] = model.at(other.world_offset)
+            place = " ".join(f"{x:.12g}" for x in other.world_offset)
+            notes.append(f"{paths[i].name} does not say where its positions count from: taken as {place}")
+    one, two = (replace(side, model=model) for side, model in zip(opened, models, strict=True))
+    return (one, two), tuple(notes)
+
+
+def _counts_from_the_other(model: Renderable, other: Renderable) -> bool:
+    """Splats whose positions are those of the other's local frame, which most formats have no place to say."""
+    if not isinstance(model, SplatModel) or any(model.world_offset) or not any(other.world_offset):
+        return False
+    middle, others = (np.median(m.bounds[0].astype(np.float64), 0) for m in (model, other))
+    world = others + np.array(other.world_offset)
+    return bool(np.linalg.norm(middle - others) < np.linalg.norm(middle - world))
+
+
+def _places(
+    sides: tuple[_Side, _Side],
+    scene: Scene | None,
+    cameras: Sequence[tuple[str, Camera]] | str | Path | None,
+) -> tuple[list[_Place], str]:
+    """Where to look from, and in words where that comes from. Raises SceneError."""
+    if scene is not None:
+        if not scene.test_views:
+            raise SceneError(f"{scene.name}: no view is held out to compare with; load with hold-out")
+        places = [_Place(view.name, view.camera, view) for view in scene.test_views]
+        return places, f"held-out views of {scene.name}"
+    if cameras is not None:
+        given = read_cameras(Path(cameras)) if isinstance(cameras, str | Path) else cameras
+        if not given:
+            raise UnsupportedCamera("no cameras were given to compare from")
+        origin = f"cameras of {Path(cameras).name}" if isinstance(cameras, str | Path) else "given cameras"
+        return [_Place(name, camera, None) for name, camera in given], origin
+    for side in sides:
+        kept = side.model.viewpoints
+        if len(kept) >= LEAST_OWN:
+            return [
+                _Place(f"camera {i}", camera, None) for i, camera in enumerate(kept)
+            ], f"cameras that {side.path.name} keeps"
+    model = sides[0].model
+    around = surround(model.bounds[0])[::AROUND_EVERY]
+    back = -np.array(model.world_offset)
+    return [_Place(name, camera.moved(back), None) for name, camera in around], "cameras around the scene"
+
+
+def _compared(
+    sides: tuple[_Side, _Side],
+    places: Sequence[_Place],
+    origin: str,
+    scene: Scene | None,
+    notes: tuple[str, ...],
+    device: str,
+    progress: Callable[[int, int], None] | None,
+    keep: Callable[[ComparedView, dict[str, np.ndarray]], None] | None = None,
+) -> Comparison:
+    """`keep` is given each view and its pictures: a, b, difference and, where there is one, the photograph as gt."""
+    for side in sides:
+        timed_render(side.model, places[0].camera)  # caches are filled: not what a view costs
+    rows: list[ComparedView] = []
+    seconds: list[list[float]] = []
+    for i, place in enumerate(places):
+        (a, a_seconds), (b, b_seconds) = (timed_render(side.model, place.camera) for side in sides)
+        photograph = None if place.view is None else place.view.image
+        levels = levels_between(a, b)
+        scale = scale_for([levels])
+        a_psnr, a_ssim = _quality(a, photograph)
+        b_psnr, b_ssim = _quality(b, photograph)
+        rows.append(
+            ComparedView(
+                name=place.name,
+                file=f"{i:05d}.png",
+                psnr=metrics.psnr(a, b),
+                ssim=metrics.ssim(b, a),
+                a_psnr=a_psnr,
+                a_ssim=a_ssim,
+                b_psnr=b_psnr,
+                b_ssim=b_ssim,
+                difference_scale=scale,
+            )
+        )
+        seconds.append([a_seconds, b_seconds])
+        if keep:
+            pictures = {"a": a, "b": b, "difference": difference_picture(levels, scale)}
+            keep(rows[-1], pictures if photograph is None else {**pictures, "gt": photograph})
+        if progress:
+            progress(i + 1, len(places))
+    return Comparison(
+        compgs=__version__,
+        a=_described(sides[0], [row.a_psnr for row in rows], [row.a_ssim for row in rows], seconds, 0),
+        b=_described(sides[1], [row.b_psnr for row in rows], [row.b_ssim for row in rows], seconds, 1),
+        scene=scene.name if scene else None,
+        cameras=origin,
+        width=places[0].camera.width,
+        height=places[0].camera.height,
+        device=device_name(device),
+        threads=numba.get_num_threads(),
+        notes=notes,
+        per_view=tuple(rows),
+    )
+
+
+def _quality(image: np.ndarray, photograph: np.ndarray | None) -> tuple[float | None, float | None]:
+    """PSNR and SSIM against the photograph, where there is one."""
+    if photograph is None:
+        return None, None
+    return metrics.psnr(image, photograph), metrics.ssim(image, photograph)
+
+
+def _described(
+    side: _Side,
+    psnr: Sequence[float | None],
+    ssim: Sequence[float | None],
+    seconds: Sequence[Sequence[float]],
+    index: int,
+) -> ComparedFile:
+    components = component_bytes(side.path)
+    counts = side.model.counts
+    return ComparedFile(
+        file=side.path.name,
+        format=format_of(side.path).name,
+        bytes=sum(components.values()),  # of a meta.json that of its pictures, too
+        sha256=hashlib.sha256(side.path.read_bytes()).hexdigest(),
+        components=components,
+        primitives=counts.get("splats") or counts.get("coupled_primitives") or 0,
+        anchors=counts.get("anchors"),
+        coupled_primitives=counts.get("coupled_primitives"),
+        splats=counts.get("splats"),
+        psnr=_mean(psnr),
+        ssim=_mean(ssim),
+        decode_seconds=side.decode_seconds,
+        render_seconds=median(pair[index] for pair in seconds),
+    )
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None

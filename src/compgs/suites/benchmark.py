@@ -1,0 +1,102 @@
+"""A suite from its file to its tables."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from compgs.errors import CompGSError, ConfigError
+from compgs.evaluation.reports.tables import Table
+from compgs.suites.cluster import Needs, check_ray, run_on_cluster
+from compgs.suites.jobs import Job, Outcome, check_scenes, jobs_of
+from compgs.suites.results import write_results
+from compgs.suites.serial import run_serially
+from compgs.suites.suite import Suite
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What came out."""
+
+    tables: tuple[Table, ...]
+    files: tuple[Path, ...]
+    failed: tuple[Outcome, ...]
+    jobs: int
+
+
+def benchmark(
+    suite: Suite,
+    output: str | Path,
+    *,
+    data: str | Path = ".",
+    scenes: Sequence[str] = (),
+    methods: Sequence[str] = (),
+    cluster: str | None = None,
+    needs: Needs | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Benchmark:
+    """Run what of a suite has not been run, and write its tables and its report into `output`.
+
+    `data`: folder of the scenes. `scenes`, `methods`: names of some, else all. `cluster`: address of a Ray cluster, or
+    "local"; None: one run after the other. `progress(done, total, what)` is called when runs begin and end. Runs
+    that fail are left out and said; the others stay, and the same call runs them again.
+
+    Raises SceneError for missing scenes, ConfigError, MissingDependency, OutputError; ReportError if all runs failed.
+    """
+    chosen, notes = measurable(some_of(suite, scenes, methods))
+    folder = Path(output).absolute()
+    data_folder = Path(data).absolute()
+    check_scenes(chosen, data_folder)
+    if cluster is not None:
+        check_ray()
+    jobs = jobs_of(chosen, data_folder, folder)
+    outcomes: list[Outcome] = []
+    show = progress or (lambda done, total, what: None)
+    show(0, len(jobs), "")
+
+    def started(job: Job) -> None:
+        show(len(outcomes), len(jobs), in_words(job))
+
+    running: Iterator[Outcome] = (
+        run_serially(jobs, started) if cluster is None else run_on_cluster(jobs, cluster, needs, started)
+    )
+    for outcome in running:
+        outcomes.append(outcome)
+        show(len(outcomes), len(jobs), in_words(outcome.job))
+    failed = tuple(outcome for outcome in outcomes if outcome.error)
+    notes += [f"{in_words(outcome.job)} failed: {outcome.error}" for outcome in failed]
+    tables, files = write_results(chosen, jobs, folder, notes)
+    return Benchmark(tuple(tables), tuple(files), failed, len(jobs))
+
+
+def some_of(suite: Suite, scenes: Sequence[str], methods: Sequence[str]) -> Suite:
+    """Raises ConfigError for a name that the suite does not have."""
+    for asked, known, what in (
+        (scenes, [scene.name for scene in suite.scenes], "scene"),
+        (methods, [method.name for method in suite.methods], "method"),
+    ):
+        for name in asked:
+            if name not in known:
+                raise ConfigError(f"{what} {name!r}: not in the suite, which has {', '.join(known)}")
+    return replace(
+        suite,
+        scenes=tuple(scene for scene in suite.scenes if not scenes or scene.name in scenes),
+        methods=tuple(method for method in suite.methods if not methods or method.name in methods),
+    )
+
+
+def measurable(suite: Suite) -> tuple[Suite, list[str]]:
+    """Without LPIPS where it cannot be measured, which is said: the rest of a table is worth having."""
+    if not suite.train.get("lpips"):
+        return suite, []
+    from compgs.metrics import lpips_network
+
+    try:
+        lpips_network("vgg")
+    except CompGSError as reason:
+        train = {key: value for key, value in suite.train.items() if key != "lpips"}
+        return replace(suite, train=train), [f"LPIPS is unavailable: {reason}"]
+    return suite, []
+
+
+def in_words(job: Job) -> str:
+    return ", ".join(part for part in (job.scene, job.method, job.rate, f"seed {job.seed}") if part)

@@ -1,0 +1,235 @@
+"""Inter-primitive prediction (CompGS Sec. 3.2): anchors and residuals in, Gaussians out. The readable version.
+
+`f` reference embedding of an anchor, `g_k` residual embedding of a coupled primitive, `v` view embedding of an anchor
+(unit direction from the camera, distance); networks give translation `t_k`, scaling `S_k`, rotation, `alpha_k`, `c_k`:
+
+    mean_k = mean + reach t_k    scales_k = size sigmoid(S_k)    opacity_k = tanh(alpha_k)    color_k = sigmoid(c_k)
+
+Opacity is predicted first: a coupled primitive that is not seen needs nothing else. The networks are in `heads.py`.
+Everything runs on any device, in any precision, with gradients; on the CPU in float32 its twin is
+`model/prediction_kernels.py`, for training through `autograd.py` and for rendering through `model/inference.py`.
+"""
+
+import contextlib
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from compgs.cameras import Camera
+from compgs.gaussians import Gaussians
+from compgs.model.constants import OPACITY_CUTOFF, SMALLEST_DISTANCE
+from compgs.tensors.primitives import Primitives
+
+if TYPE_CHECKING:
+    from compgs.tensors.heads import PredictionHeads
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Gaussians of one view, and where they come from."""
+
+    gaussians: Gaussians  # M primitives
+    index: Tensor  # [M] int64, ascending: which coupled primitives (of P) they are
+    opacities: Tensor  # [P] of all coupled primitives; not above 0: not drawn
+    drawn: Tensor | None = None  # [M] bool: those that are drawn, of opacity above 0; None: all M
+
+
+@functools.lru_cache(maxsize=4096)
+def camera_center(camera: Camera, device: torch.device) -> Tensor:
+    """[3] float32, world units; kept, as a copy to a GPU waits for it to finish its work."""
+    return torch.tensor(camera.center, dtype=torch.float32, device=device)
+
+
+# the equations ---------------------------------------------------------------------------------
+
+
+def view_embedding(
+    positions: Tensor,  # [N, 3] of anchors, world units
+    camera_center: Tensor,  # [3] world units
+    distance_unit: float,  # world units
+) -> Tensor:  # [N, 4]
+    """Unit direction from the camera to the anchor, and distance in `distance_unit` (Sec. 3.2)."""
+    offset = positions - camera_center
+    distance = offset.norm(dim=1, keepdim=True)
+    return torch.cat([offset / distance.clamp_min(SMALLEST_DISTANCE), distance / distance_unit], 1)
+
+
+def see(
+    references: Tensor,  # [N, reference_dim] of anchors
+    positions: Tensor,  # [N, 3] of the same, world units
+    camera_center: Tensor,  # [3] world units
+    distance_unit: float,  # world units
+) -> Tensor:  # [N, reference_dim + 4]
+    """What the networks of opacity and color take of an anchor: reference embedding, then view embedding."""
+    return torch.cat([references, view_embedding(positions, camera_center, distance_unit)], 1)
+
+
+def opacity_activation(raw: Tensor) -> Tensor:
+    """[P, 1 or more] raw numbers of which opacity is the first -> [P] opacities, -1 to 1."""
+    return torch.tanh(raw[:, 0])
+
+
+def color_activation(raw: Tensor) -> Tensor:
+    """[M, 3] raw -> [M, 3] display RGB, 0 to 1."""
+    return torch.sigmoid(raw)
+
+
+def is_drawn(opacities: Tensor) -> Tensor:
+    """[P] -> [P] bool: whether a primitive reaches the renderer."""
+    return opacities.detach() > OPACITY_CUTOFF
+
+
+def affine_transform(
+    raw: Tensor,  # [M, 10] output of the geometry network: translation, scaling, quaternion
+    positions: Tensor,  # [M, 3] of the anchors, world units
+    reach: Tensor,  # [M, 3] of the anchors: world units per unit of a translation
+    sizes: Tensor,  # [M, 3] of the anchors: standard deviations, world units
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Means, scales [M, 3] and quaternions [M, 4] of coupled primitives (Eq. 2 and 4).
+
+    mean_k = mean + t_k * reach, covariance_k = R_k S_k Sigma S_k R_k^T with Sigma = diag(sizes)^2 and
+    0 < S_k < 1. As printed, S_k R_k Sigma is not symmetric and so no covariance: docs/paper_map.md.
+    """
+    means = positions + raw[:, :3] * reach
+    scales = torch.sigmoid(raw[:, 3:6]) * sizes
+    # An identity offset keeps the norm away from zero, where the direction has no gradient.
+    return means, scales, torch.cat([raw[:, 6:7] + 1.0, raw[:, 7:10]], 1)
+
+
+# put together ---------------------------------------------------------------------------------
+
+
+def predict(
+    heads: "PredictionHeads",
+    primitives: Primitives,
+    camera_center: Tensor,  # [3] world units
+    distance_unit: float,  # world units
+    weights: dict[str, Tensor] | None = None,
+    *,
+    compact: bool = True,
+    appearance_dtype: torch.dtype = torch.float32,
+) -> Prediction:
+    """Gaussians of all coupled primitives that can be seen from a camera (Sec. 3.2).
+
+    `weights`: other parameter values for the heads (as they will be stored), by name. Not `compact`: all coupled
+    primitives, those that are not drawn with opacity 0; the same image and gradients by more arithmetic, but a GPU need
+    not be waited for to learn how many there are. `appearance_dtype`: of the networks of opacity and color.
+    """
+    seen = see(primitives.references, primitives.positions, camera_center, distance_unit)
+    function = _drawn if compact else _all
+    if weights is None:
+        return function(heads, primitives, seen, appearance_dtype)
+    arguments = function, primitives, seen, appearance_dtype
+    prediction: Prediction = torch.func.functional_call(heads, weights, arguments)
+    return prediction
+
+
+def _drawn(
+    heads: "PredictionHeads", primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype
+) -> Prediction:
+    """What is drawn, by the fastest means that the heads have."""
+    return heads.predict_drawn(primitives, seen, appearance_dtype)
+
+
+def _all(
+    heads: "PredictionHeads", primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype
+) -> Prediction:
+    """All, drawn or not."""
+    return predict_by_torch(heads, primitives, seen, appearance_dtype, compact=False)
+
+
+def predict_by_torch(
+    heads: "PredictionHeads",
+    primitives: Primitives,
+    seen: Tensor,  # [N, reference_dim + 4]: references and view embeddings
+    appearance_dtype: torch.dtype = torch.float32,
+    *,
+    compact: bool = True,
+) -> Prediction:
+    """`predict` by the heads as they are, in plain torch (the networks alone run in kernels where they can)."""
+    p = primitives
+    a = predict_appearance(heads, seen, p.residuals, p.anchor_index, dtype=appearance_dtype, compact=compact)
+    means, scales, quaternions = predict_geometry(heads, p, a.residuals, a.anchor)
+    gaussians = Gaussians(means, quaternions, scales, a.opacities, a.colors)
+    if a.index is not None:
+        return Prediction(gaussians, a.index, a.all_opacities)
+    index = torch.arange(len(a.opacities), device=seen.device)
+    return Prediction(gaussians, index, a.all_opacities, is_drawn(a.all_opacities))
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Opacity and color of M of P coupled primitives, and the inputs from which their geometry is predicted."""
+
+    all_opacities: Tensor  # [P]
+    index: Tensor | None  # [M] int64, ascending: those that are drawn; None: all
+    opacities: Tensor  # [M]; 0: not drawn
+    colors: Tensor  # [M, 3] display RGB
+    residuals: Tensor  # [M, residual_dim]
+    anchor: Tensor  # [M] int64, ascending
+
+
+def predict_appearance(
+    heads: "PredictionHeads",
+    seen: Tensor,  # [A, reference_dim + 4]: references and view embeddings of anchors
+    residuals: Tensor,  # [P, residual_dim]
+    anchor_index: Tensor,  # [P] int64, ascending: rows of `seen`
+    *,
+    dtype: torch.dtype,  # in which the networks compute
+    compact: bool,
+) -> Appearance:
+    """Opacity of all, color of those that are drawn; not `compact`: color of all, and no value decides a shape."""
+    with appearance_precision(residuals.device, dtype):
+        raw = heads.raw_appearance(seen, residuals, anchor_index).to(residuals.dtype)
+    opacities = all_opacities = opacity_activation(raw)
+    index, anchor = None, anchor_index
+    if compact:
+        index = torch.nonzero(is_drawn(opacities)).view(-1)
+        opacities, anchor = opacities.index_select(0, index), anchor_index.index_select(0, index)
+        residuals = residuals.index_select(0, index)
+    else:
+        opacities = torch.where(is_drawn(opacities), opacities, torch.zeros_like(opacities))
+    with appearance_precision(residuals.device, dtype):
+        color = heads.raw_color(raw, index, seen, residuals, anchor).to(residuals.dtype)
+    return Appearance(all_opacities, index, opacities, color_activation(color), residuals, anchor)
+
+
+def predict_geometry(
+    heads: "PredictionHeads",
+    primitives: Primitives,
+    residuals: Tensor,  # [M, residual_dim]
+    anchor: Tensor,  # [M] int64, ascending: rows of `primitives`
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Means, scales [M, 3] and quaternions [M, 4] of coupled primitives, world units."""
+    p = primitives
+    return affine_transform(
+        heads.raw_geometry(p.references, residuals, anchor),
+        p.positions.index_select(0, anchor),
+        p.reach.index_select(0, anchor),
+        p.sizes.index_select(0, anchor),
+    )
+
+
+# where it runs ---------------------------------------------------------------------------------
+
+
+def choosing_pays(device: torch.device) -> bool:
+    """Whether to leave out primitives that are not drawn: not where their number must first come from a GPU."""
+    return device.type != "cuda"
+
+
+def runs_in_kernels(device: torch.device, *dtypes: torch.dtype) -> bool:
+    """Whether the kernels compute it: on the CPU, in float32."""
+    return device.type == "cpu" and all(dtype == torch.float32 for dtype in dtypes)
+
+
+def appearance_precision(
+    device: torch.device, dtype: torch.dtype
+) -> contextlib.AbstractContextManager[object]:
+    """Within it, the networks of opacity and color compute in `dtype` (float32: as always)."""
+    if dtype == torch.float32:
+        return contextlib.nullcontext()
+    return torch.autocast(device.type, dtype=dtype, cache_enabled=False)

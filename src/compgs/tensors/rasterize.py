@@ -1,0 +1,30 @@
+"""One function from tensors to pixels; the device decides who draws."""
+
+import torch
+from torch import Tensor
+
+from compgs.cameras import Camera
+from compgs.gaussians import Gaussians
+from compgs.render.result import RasterResult
+from compgs.render.settings import DEFAULT_SETTINGS, RasterSettings
+from compgs.tensors.reference import rasterize_reference
+
+
+def rasterize(
+    gaussians: Gaussians[Tensor], camera: Camera, settings: RasterSettings = DEFAULT_SETTINGS
+) -> RasterResult[Tensor]:
+    """Differentiable rendering: gsplat on CUDA, numba for float32 on the CPU, the reference otherwise.
+
+    Gradients go to means, quaternions, scales, opacities and colors; cameras and settings are constants.
+    """
+    means = gaussians.means
+    # Imported here: a renderer on the CPU needs no gsplat, one on CUDA no compiled CPU kernels.
+    if means.is_cuda:
+        from compgs.tensors.gsplat_backend import rasterize_gsplat
+
+        return rasterize_gsplat(gaussians, camera, settings)
+    if means.device.type == "cpu" and means.dtype == torch.float32:
+        from compgs.tensors.numba_backend import rasterize_numba
+
+        return rasterize_numba(gaussians, camera, settings)
+    return rasterize_reference(gaussians, camera, settings)

@@ -1,0 +1,110 @@
+"""A checkpoint comes from a file, and files may be damaged: what is restored from one is checked like any input.
+
+Values that nothing else would stop are looked at here; whatever else goes wrong while a run is put together again
+becomes a CheckpointError, too.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from compgs.errors import CheckpointError, ConfigError, SceneError
+
+# What Python, torch and numpy raise for content of another kind than was written.
+_MISFITS = (
+    ConfigError, SceneError, ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError,
+    OverflowError, RecursionError, AssertionError,
+)  # fmt: skip
+
+
+@contextmanager
+def restoring(path: Path) -> Iterator[None]:
+    """What goes wrong inside is the fault of the checkpoint at `path`: raises CheckpointError."""
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except _MISFITS as error:
+        reason = f"{type(error).__name__}: {str(error)[:200]}"
+        raise CheckpointError(
+            f"{path}: the checkpoint is damaged ({reason}); copy it again, or train anew"
+        ) from error
+
+
+def check_tensors(found: Mapping[str, Tensor], expected: Mapping[str, Tensor], what: str) -> None:
+    """Raises ValueError, naming it, for the first tensor that is not of the expected name, type and shape, or that
+    holds a value that is not finite."""
+    if found.keys() != expected.keys():
+        differing = ", ".join(sorted(found.keys() ^ expected.keys())[:3])
+        raise ValueError(f"{what}: expected other tensors than were found, see {differing}")
+    for name, value in found.items():
+        check_tensor(value, expected[name].shape, expected[name].dtype, f"{what} {name}")
+
+
+def check_tensor(value: Tensor, shape: Sequence[int], dtype: torch.dtype, what: str) -> None:
+    """Raises ValueError for another shape or type, or values that are not finite."""
+    if tuple(value.shape) != tuple(shape) or value.dtype != dtype:
+        raise ValueError(
+            f"{what}: expected {list(shape)} of {dtype}, found {list(value.shape)} of {value.dtype}"
+        )
+    if value.is_floating_point() and not torch.isfinite(value).all():
+        raise ValueError(f"{what}: holds values that are not finite")
+
+
+def check_moments(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor]) -> None:
+    """Adam's, by `parameter/moment`. Raises ValueError, KeyError."""
+    for name, value in tensors.items():
+        parameter, moment = name.rsplit("/", 1)
+        of = parameters[parameter]
+        shape = () if moment == "step" else of.shape
+        check_tensor(value, shape, torch.float32 if moment == "step" else of.dtype, f"moment {name}")
+        if moment not in ("step", "exp_avg", "exp_avg_sq"):
+            raise ValueError(f"{name} is no moment of Adam's")
+        if moment != "exp_avg" and (value < 0).any():
+            raise ValueError(f"moment {name}: expected nothing below 0")
+    whole = {
+        f"{name.rsplit('/', 1)[0]}/{moment}"
+        for name in tensors
+        for moment in ("step", "exp_avg", "exp_avg_sq")
+    }
+    if whole != set(tensors):
+        raise ValueError(f"moments are missing, such as {min(whole - set(tensors))}")
+
+
+def restore_statistics(control: Any, names: Sequence[str], extra: Mapping[str, Tensor]) -> None:
+    """The attributes of a density control, as large as those that it has. Raises ValueError, KeyError."""
+    for name in names:
+        value, now = extra[f"control/{name}"], getattr(control, name)
+        check_tensor(value, now.shape, now.dtype, f"control/{name}")
+        setattr(control, name, value.to(now.device))
+
+
+def restore_chance(generator: torch.Generator, extra: Mapping[str, Tensor]) -> None:
+    """Its state. Raises ValueError, KeyError, RuntimeError for what is none."""
+    state = generator.get_state()
+    check_tensor(extra["chance"], state.shape, state.dtype, "chance")
+    generator.set_state(extra["chance"])
+
+
+def check_step(state: Mapping[str, Any], steps: int) -> None:
+    """Of the run's state. Raises ValueError for a step outside of the run."""
+    step = state["step"]
+    if not isinstance(step, int) or isinstance(step, bool) or not 0 <= step <= steps:
+        raise ValueError(f"step {step!r} of {steps}")
+
+
+def finite(values: Any, count: int, what: str, *, above: float = -math.inf) -> tuple[float, ...]:
+    """So many numbers of a list. Raises ValueError for anything else."""
+    sound = isinstance(values, list) and len(values) == count
+    if not sound or not all(_is_number(v) and math.isfinite(v) and v > above for v in values):
+        raise ValueError(f"{what}: expected {count} finite numbers, found {values!r:.60}")
+    return tuple(map(float, values))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

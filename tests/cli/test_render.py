@@ -1,0 +1,106 @@
+"""`compgs render`: ways through a scene, videos, and what becomes of old images."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import compgs
+from compgs.cli.main import main
+from compgs.evaluation.camera_path import camera_entry
+from compgs.metrics import psnr, to_8bit
+
+SIZE = ("--width", "48", "--height", "32")
+
+
+def write_path(file: Path, path: Path, count: int) -> Path:
+    """A camera file of the first cameras that a file keeps."""
+    cameras = compgs.decode(file).viewpoints[:count]
+    path.write_text(json.dumps([camera_entry(camera, f"key {i}") for i, camera in enumerate(cameras)]))
+    return path
+
+
+def rendered(*arguments: object) -> int:
+    return main(["render", *map(str, arguments)])
+
+
+def test_a_recorded_path_is_gone_from_its_first_camera_to_its_last(tiny_cgs: Path, tmp_path: Path) -> None:
+    keys = write_path(tiny_cgs, tmp_path / "path.json", 3)
+    out = tmp_path / "out"
+    assert rendered(tiny_cgs, "--path", keys, "--frames", 5, *SIZE, "-o", out) == 0
+    model = compgs.decode(tiny_cgs)
+    entries = json.loads((out / "cameras.json").read_text())
+    assert len(entries) == 5 and len(list(out.glob("*.png"))) == 5
+    for entry, key in ((entries[0], model.viewpoints[0]), (entries[4], model.viewpoints[2])):
+        np.testing.assert_allclose(entry["world_to_camera"], key.world_to_camera, atol=1e-6)
+        np.testing.assert_allclose(entry["fx"] / 48, key.fx / key.width)
+    camera = model.viewpoints[0].resized(48, 36)
+    image = np.asarray(Image.open(out / "00000.png"))
+    expected = to_8bit(compgs.render(model, camera).image)
+    assert psnr(image, expected[2:34]) > 40
+
+
+def test_a_video_has_the_frames_of_the_way(tiny_cgs: Path, tmp_path: Path) -> None:
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    out = tmp_path / "tour.mp4"
+    assert rendered(tiny_cgs, "--frames", 4, *SIZE, "--fps", 8, "-o", out) == 0
+    assert imageio_ffmpeg.count_frames_and_secs(str(out)) == (4, 0.5)
+    assert rendered(tiny_cgs, "--frames", 2, *SIZE, "-o", out) == 1  # it is there already
+    assert rendered(tiny_cgs, "--frames", 2, *SIZE, "-o", out, "--overwrite") == 0
+    assert imageio_ffmpeg.count_frames_and_secs(str(out))[0] == 2
+
+
+def test_no_old_image_stays_among_new_ones(tiny_cgs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert rendered(tiny_cgs, "--frames", 6, *SIZE, "-o", out) == 0
+    (out / "notes.txt").write_text("mine")
+    assert rendered(tiny_cgs, "--frames", 2, *SIZE, "-o", out, "--overwrite") == 0
+    assert sorted(p.name for p in out.iterdir()) == ["00000.png", "00001.png", "cameras.json", "notes.txt"]
+    assert len(json.loads((out / "cameras.json").read_text())) == 2
+
+
+def test_old_images_stay_until_there_is_a_new_one(
+    tiny_cgs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    assert rendered(tiny_cgs, "--frames", 2, *SIZE, "-o", out) == 0
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+
+    def failing(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("compgs.evaluation.measure.timed_render", failing)
+    assert rendered(tiny_cgs, "--frames", 2, *SIZE, "-o", out, "--overwrite") == 1
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+
+
+def test_wrong_paths_are_named(tiny_cgs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = write_path(tiny_cgs, tmp_path / "one.json", 1)
+    for path, complaint in (("circle", "expected cameras, orbit or a camera file"), (one, "found 1")):
+        assert rendered(tiny_cgs, "--path", path, "-o", tmp_path / "out") == 2
+        assert f"--path {path}: " in (error := capsys.readouterr().err) and complaint in error
+    assert rendered(tiny_cgs, tmp_path, "--path", write_path(tiny_cgs, one, 2), "-o", tmp_path / "out") == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_video_of_cameras_of_two_sizes_is_refused(
+    tiny_cgs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    one = compgs.decode(tiny_cgs).viewpoints[0]
+    cameras = tmp_path / "cameras.json"
+    cameras.write_text(json.dumps([camera_entry(one, "a"), camera_entry(one.resized(32, 24), "b")]))
+    assert rendered(tiny_cgs, "--cameras", cameras, "-o", tmp_path / "out.mp4") == 2
+    assert "32 x 24, 64 x 48; name a folder" in capsys.readouterr().err
+    assert not (tmp_path / "out.mp4").exists()
+
+
+def test_without_ffmpeg_a_video_is_refused_before_anything_is_read(
+    tmp_path: Path, tiny_cgs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert rendered(tiny_cgs, tmp_path / "nowhere", "-o", tmp_path / "out.mp4") == 1
+    assert "pip install '.[video]' in the project's folder" in capsys.readouterr().err

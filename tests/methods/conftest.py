@@ -1,0 +1,134 @@
+"""A method that nobody would publish: masks learned with the splats, then few colors for all of them."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from compgs.config import Config, Range
+from compgs.formats import SplatArrays
+from compgs.formats.packed import SUFFIX, Packed, packed_bits, splat_model, unpacked_bits, write_packed
+from compgs.methods import METHODS, SPLAT_SETTINGS, Method
+from compgs.model.splats import SplatModel
+from compgs.tensors.splats import Splats
+from compgs.training import Hooks, Phase, fine_tuning, train_phases
+
+BITS = 3
+
+
+@dataclass(frozen=True)
+class ToySection:
+    # of the steps that follow plain training
+    tuned: Annotated[float, Range(0, 1, above=True)] = 0.5
+    # weight of the masks
+    weight: Annotated[float, Range(0, 10)] = 0.01
+
+
+@dataclass(frozen=True)
+class ToyConfig(Config):
+    toy: ToySection = field(default_factory=ToySection)
+
+
+class Masks(Hooks):
+    """How much of each splat is drawn."""
+
+    per_splat = ("mask",)
+
+    def __init__(self, weight: float) -> None:
+        super().__init__()
+        self.rates = {"mask": (0.05, 0.01)}
+        self.weight = weight
+
+    def begin(self, trainer: Any) -> None:
+        self.mask = nn.Parameter(torch.full((len(trainer.parameters),), 2.0))
+
+    def transform(self, splats: Splats, trainer: Any) -> Splats:
+        return replace(splats, opacity_logits=splats.opacity_logits - torch.exp(-self.mask))
+
+    def loss(self, drawn: Any, trainer: Any) -> torch.Tensor:
+        return self.weight * self.mask.sigmoid().mean()
+
+    def finish(self, trainer: Any) -> None:
+        if self.mask.isfinite().all():  # the second time there is nothing to add
+            trainer.parameters.opacity_logits.data -= torch.exp(-self.mask.detach())
+            self.mask.data.fill_(torch.inf)
+
+
+class FewColors(Hooks):
+    """Colors of a palette, which is trained."""
+
+    per_splat = ("labels",)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rates = {"palette": (1e-3, 1e-3)}
+
+    def begin(self, trainer: Any) -> None:
+        dc = trainer.parameters.dc.detach()
+        self.palette = nn.Parameter(dc[torch.linspace(0, len(dc) - 1, 1 << BITS).long()].clone())
+        self.register_buffer("labels", torch.cdist(dc, self.palette.detach()).argmin(1))
+
+    def transform(self, splats: Splats, trainer: Any) -> Splats:
+        return replace(splats, dc=self.palette[self.labels])
+
+
+def train(scene: Any, config: ToyConfig, run: Any, start: SplatModel | None = None) -> tuple[Any, Any]:
+    config = replace(config, splats=replace(config.splats, harmonics=0))
+    tuned = fine_tuning(config, max(1, round(config.toy.tuned * config.training.steps)))
+    masked = Phase(config, lambda: Hooks() if start else Masks(config.toy.weight))
+    trainer = train_phases(scene, (masked, Phase(tuned, FewColors)), run, start)
+    return trainer.model(), trainer.hooks
+
+
+def write(trained: tuple[Any, Any], path: Path, config: ToyConfig) -> int:
+    model, colors = trained
+    arrays = model.splats
+    stored = {
+        name: getattr(arrays, name) for name in ("means", "log_scales", "quaternions", "opacity_logits")
+    }
+    labels = packed_bits(colors.labels.cpu().numpy(), BITS)
+    palette = colors.palette.detach().cpu().numpy()
+    facts = {"offset": list(model.world_offset)}
+    return write_packed(path, Packed("toy", facts, {**stored, "labels": labels, "palette": palette}))
+
+
+def open_file(packed: Packed, device: Any, background: Any) -> SplatModel:
+    means = packed.array("means", np.float32, (None, 3))
+    count = len(means)
+    labels = packed.array("labels", np.uint8, (-(-count * BITS // 8),))
+    palette = packed.array("palette", np.float32, (1 << BITS, 3))
+    arrays = SplatArrays(
+        means,
+        packed.array("log_scales", np.float32, (count, 3)),
+        packed.array("quaternions", np.float32, (count, 4)),
+        packed.array("opacity_logits", np.float32, (count,)),
+        palette[unpacked_bits(labels, BITS, count)],
+        np.zeros((count, 0, 3), np.float32),
+    )
+    return splat_model(packed, arrays, device, background)
+
+
+TOY = Method(
+    name="toy",
+    description="few colors",
+    reference="these tests",
+    suffix=SUFFIX,
+    uses=(*SPLAT_SETTINGS, "toy"),
+    train=train,
+    write=write,
+    open=open_file,
+    settings=ToyConfig,
+    presets={"heavy": {"toy": {"weight": 1.0}}},
+    from_splats=True,
+)
+
+
+@pytest.fixture(autouse=True)
+def toy(monkeypatch: pytest.MonkeyPatch) -> Method:
+    """That method, registered."""
+    monkeypatch.setitem(METHODS, "toy", TOY)
+    return TOY

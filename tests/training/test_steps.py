@@ -1,0 +1,209 @@
+"""What one step of training computes and moves, against formulas written out here."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from compgs.config import Config
+from compgs.numerics.ssim import ssim
+from compgs.render import render
+from compgs.scene.views import Scene, View
+from compgs.training.rate_control import RateState
+from compgs.training.trainer import Trainer
+
+CPU = torch.device("cpu")
+STEPS = 20
+# Nothing is left to chance: no primitive is left out, and from the first step on the likelihood sees symbols.
+CERTAIN = {"steps": STEPS, "left_out": 0.0, "hard_rate": 0.0, "rate_start": 0.0}
+
+
+def with_training(config: Config, **settings: object) -> Config:
+    return replace(config, training=replace(config.training, **settings))
+
+
+def started(scene: Scene, config: Config, step: int = 0, view: int = 2) -> Trainer:
+    """A run that has come to a step, on latents that say something, with a view to come."""
+    trainer = Trainer(scene, config, CPU)
+    chance = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for latents in (trainer.model.references, trainer.model.residuals):
+            latents += torch.randn(latents.shape, generator=chance)
+    trainer.step = step
+    trainer.views.order = [view]
+    return trainer
+
+
+def parts_of_loss(trainer: Trainer, view: View) -> tuple[float, float, float, dict[str, float]]:
+    """L1, SSIM, mean volume of what is drawn in fifths of the larger of extent and distance, mean bits by stream."""
+    hybrid = trainer.model.as_hybrid_model(stored_weights=False)
+    image = render(hybrid, view.camera).image.double()
+    photograph = torch.from_numpy(view.image.copy()).double() / 255
+    drawn = hybrid.gaussians(view.camera)
+    distances = np.linalg.norm(drawn.means.double().numpy() - view.camera.center, axis=1)
+    units = np.maximum(distances, trainer.scene.extent) / 5
+    volumes = drawn.scales.double().prod(1).numpy() / units**3
+    bits = trainer.model.quantized(rate=True, stored_weights=False).bits
+    return (
+        float((image - photograph).abs().mean()),
+        float(ssim(image, photograph)),
+        float(volumes.mean()),
+        {name: float(b.detach().double().mean()) for name, b in bits.items()},
+    )
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"ssim_weight": 0.0},
+        {"ssim_weight": 1.0},
+        {"scale_weight": 2e4},
+        {"lmbda": 0.5},
+        {"lmbda": 0.5, "rate": "elements"},
+        {"lmbda": 0.5, "rate_start": 0.1},
+    ],
+    ids=str,
+)
+def test_the_loss_of_a_step_is_its_formula(
+    blob_scene: Scene, tiny_config: Config, settings: dict[str, object]
+) -> None:
+    config = with_training(tiny_config, **{**CERTAIN, **settings})
+    trainer = started(blob_scene, config)
+    t = config.training
+    l1, similarity, volume, bits = parts_of_loss(trainer, trainer.scene.train_views[2])
+    # of this model's streams: one hyperprior channel a primitive, 4 primitives of 8 residual channels
+    elements = {"reference_hyper": config.entropy.reference_hyper_dim, "reference": 8, "covariance": 6}
+    elements |= {"residual_hyper": 4, "residual": 32}
+    if t.rate == "elements":
+        rate = sum(bits[name] / elements[name] for name in elements)
+    else:
+        rate = 5 / 132 * sum(bits.values())
+    distortion = (1 - t.ssim_weight) * l1 + t.ssim_weight * (1 - similarity) + t.scale_weight * volume
+    counted = t.lmbda * rate if t.rate_start == 0 else 0.0
+    assert float(trainer.train_step().loss) == pytest.approx(distortion + counted, rel=1e-3)
+    if "scale_weight" in settings:
+        assert t.scale_weight * volume > 0.1 * distortion
+    if "lmbda" in settings:
+        assert counted == 0 or counted > distortion
+
+
+def test_the_rate_joins_the_loss_and_symbols_take_the_place_of_noise_at_their_shares_of_the_run(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    config = with_training(tiny_config, **{**CERTAIN, "rate_start": 0.25, "hard_rate": 0.5, "lmbda": 10.0})
+    found = {}
+    for step in (4, 5, 9, 10):
+        trainer = started(blob_scene, config, step)
+        l1, similarity, _, bits = parts_of_loss(trainer, trainer.scene.train_views[2])
+        symbols = 10.0 * 5 / 132 * sum(bits.values())
+        rate = float(trainer.train_step().loss) - 0.8 * l1 - 0.2 * (1 - similarity)
+        found[step] = rate / symbols
+    assert abs(found[4]) < 0.01
+    assert found[10] == pytest.approx(1, abs=1e-3)
+    for step in (5, 9):
+        assert abs(found[step] - 1) > 0.002, "noise is not the symbols"
+        assert found[step] == pytest.approx(1, abs=0.3), "but costs about as much"
+
+
+def test_lambda_that_follows_a_size_is_the_one_that_weighs(blob_scene: Scene, tiny_config: Config) -> None:
+    losses = []
+    for lmbda in (0.0, 1.0, 3.0):
+        trainer = started(blob_scene, with_training(tiny_config, **CERTAIN))
+        trainer.rate = RateState(lmbda)
+        losses.append(float(trainer.train_step().loss))
+    assert losses[2] - losses[0] == pytest.approx(3 * (losses[1] - losses[0]), rel=1e-4)
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "exponential"])
+@pytest.mark.parametrize(("step", "warm_up"), [(0, 0.5), (5, 0.5), (15, 0.5), (5, 0.0)])
+def test_learning_rates_are_those_of_the_settings_at_this_step(
+    blob_scene: Scene, tiny_config: Config, schedule: str, step: int, warm_up: float
+) -> None:
+    config = with_training(
+        tiny_config, **CERTAIN, schedule=schedule, head_warm_up=warm_up, entropy_lr_steps=2 * STEPS
+    )
+    t, progress = config.training, step / STEPS
+    trainer = started(blob_scene, config, step)
+    trainer.train_step()
+    rising = min(1.0, 0.01 + progress / warm_up) if warm_up else 1.0
+    of_group = {
+        "log_scales": (t.log_scale_lr, 1.0),
+        "references": (t.embedding_lr, 1.0),
+        "residuals": (t.embedding_lr, 1.0),
+        "entropy": (tuple(2 * rate for rate in t.entropy_lr), 1.0),
+        "geometry": (t.covariance_lr, rising),
+        "appearance": (t.color_lr, rising),
+    }
+    assert {group["name"] for group in trainer.optimizer.param_groups} == set(of_group)
+    for group in trainer.optimizer.param_groups:
+        (first, last), factor = of_group[group["name"]]
+        if schedule == "cosine":
+            expected = last + (first - last) * (1 + math.cos(math.pi * progress)) / 2
+        else:
+            expected = first ** (1 - progress) * last**progress
+        assert group["lr"] == pytest.approx(factor * expected), group["name"]
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_sparse_adam_leaves_anchors_out_of_view_alone_and_dense_adam_moves_them_on(
+    blob_scene: Scene, tiny_config: Config, sparse: bool
+) -> None:
+    """After a view of everything comes one of its middle, through a long lens."""
+    whole, other = blob_scene.train_views[:2]
+    narrow = replace(other, camera=replace(other.camera, fx=400.0, fy=400.0))
+    scene = replace(blob_scene, train_views=(whole, narrow))
+    trainer = started(scene, with_training(tiny_config, **CERTAIN, sparse_adam=sparse))
+    trainer.views.order = [1, 0]
+    model = trainer.model
+    with torch.no_grad():
+        model.log_scales -= 2.0  # so that they reach less far
+    trainer.train_step()
+    unseen = torch.ones(model.anchors, dtype=torch.bool)
+    unseen[trainer.visible_anchors(narrow.camera)] = False
+    assert 0 < unseen.sum() < model.anchors
+    before = {name: getattr(model, name).detach().clone() for name in model.anchor_parameters}
+    trainer.train_step()
+    for name, old in before.items():
+        new = getattr(model, name).detach()
+        assert torch.equal(new[unseen], old[unseen]) == sparse, name
+        assert not torch.equal(new[~unseen], old[~unseen]), name
+
+
+def test_in_the_last_steps_the_image_is_that_of_the_weights_as_they_will_be_stored(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    config = with_training(tiny_config, **CERTAIN, quantized_weights=0.5)
+    config = replace(config, entropy=replace(config.entropy, head_bits=6))
+    for step, stored in ((9, False), (10, True)):
+        trainer = started(blob_scene, config, step)
+        camera = trainer.scene.train_views[2].camera
+        expected = {
+            kind: render(trainer.model.as_hybrid_model(stored_weights=kind), camera).image
+            for kind in (False, True)
+        }
+        image = trainer.train_step().image
+        assert (image - expected[stored]).abs().mean() < 1e-4
+        assert (image - expected[not stored]).abs().mean() > 1e-3
+
+
+def test_where_views_are_few_a_step_does_without_some_primitives(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    images = {}
+    for share in (0.0, 0.4):
+        trainer = started(blob_scene, with_training(tiny_config, **{**CERTAIN, "left_out": share}))
+        view = trainer.scene.train_views[2]
+        complete = render(trainer.model.as_hybrid_model(stored_weights=False), view.camera).image
+        images[share] = float((trainer.train_step().image - complete).abs().mean())
+    assert images[0.0] < 1e-4 < 1e-2 < images[0.4]
+
+
+def test_views_come_once_each_before_any_comes_again(blob_scene: Scene, tiny_config: Config) -> None:
+    trainer = Trainer(blob_scene, with_training(tiny_config, steps=16), CPU)
+    shown = [trainer.train_step().view.name for _ in range(16)]
+    names = {view.name for view in blob_scene.train_views}
+    assert set(shown[:8]) == set(shown[8:]) == names
+    assert shown[:8] != shown[8:]

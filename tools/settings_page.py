@@ -1,0 +1,119 @@
+"""Writes docs/settings.md: every setting with its range, its value in each preset, and its comment, from config.py.
+
+    python tools/settings_page.py
+
+A test compares the page with what this makes, so that neither is changed without the other.
+"""
+
+import ast
+import dataclasses
+import re
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+from compgs import config
+from compgs.config import PRESETS, Range, load_config
+from compgs.outputs import write_bytes
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "settings.md"
+
+INTRODUCTION = """# Settings
+
+Every setting of a training, as `src/compgs/config.py` declares it; this page is made from there by
+`tools/settings_page.py`. On the command line: `--set SECTION.NAME=VALUE`, as often as needed; `--lmbda`, `--steps`,
+`--seed` and `--target-size` are settings with options of their own. A column shows a preset's value where it differs
+from `default`. "Ref." marks values of the configuration that the paper's authors released; schedules are shares of
+the run.
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    source = Path(config.__file__).read_text(encoding="utf-8")
+    presets = {name: load_config(name) for name in PRESETS}
+    parts = [INTRODUCTION]
+    for section in dataclasses.fields(config.Config):
+        kind = type(getattr(presets["default"], section.name))
+        parts.append(f"## {section.name}\n\n{summary(kind)}\n")
+        parts.append(table(kind, comments_of(source, kind.__name__), section.name, presets))
+    return "\n".join(parts)
+
+
+def summary(kind: type) -> str:
+    return (kind.__doc__ or "").strip().partition("\n")[0]
+
+
+def table(kind: type, comments: dict[str, str], section: str, presets: dict[str, Any]) -> str:
+    others = [name for name in presets if name != "default"]
+    lines = [
+        "| " + " | ".join(["setting", "default", *others, "may be", "meaning"]) + " |",
+        "|" + "---|" * (4 + len(others)),
+    ]
+    hints = typing.get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):  # type: ignore[arg-type]
+        values = {name: getattr(getattr(preset, section), field.name) for name, preset in presets.items()}
+        shown = [shown_value(values["default"])]
+        shown += [shown_value(values[name]) if values[name] != values["default"] else "" for name in others]
+        cells = [f"`{field.name}`", *shown, allowed(hints[field.name]), comments.get(field.name, "")]
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def comments_of(source: str, name: str) -> dict[str, str]:
+    """Field -> the comment lines above it, joined, of the dataclass `name` in `source`."""
+    lines = source.splitlines()
+    found = {}
+    tree = ast.parse(source)
+    body = next(node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    for node in body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            above = []
+            at = node.lineno - 2
+            while at >= 0 and lines[at].strip().startswith("#"):
+                above.append(lines[at].strip().removeprefix("#").strip())
+                at -= 1
+            found[node.target.id] = " ".join(reversed(above))
+    return found
+
+
+def allowed(hint: Any) -> str:
+    """In words: the range, or the choices, of a type."""
+    if typing.get_origin(hint) is typing.Annotated:
+        kind, *notes = typing.get_args(hint)
+        ranges = [note for note in notes if isinstance(note, Range)]
+        return "; ".join([*map(str, ranges), *(["or none"] if optional(kind) else []), *several(kind)])
+    if typing.get_origin(hint) is typing.Literal:
+        return ", ".join(f"`{choice}`" for choice in typing.get_args(hint))
+    if hint is bool:
+        return "true, false"
+    if optional(hint):
+        inner = [part for part in typing.get_args(hint) if part is not types.NoneType]
+        return f"{allowed(inner[0])}; or none"
+    return getattr(hint, "__name__", str(hint))
+
+
+def optional(kind: Any) -> bool:
+    return types.NoneType in typing.get_args(kind)
+
+
+def several(kind: Any) -> list[str]:
+    return ["several"] if typing.get_origin(kind) is tuple else []
+
+
+def shown_value(value: Any) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return ", ".join(shown_value(part) for part in value) or "none"
+    if isinstance(value, float):
+        return re.sub(r"e-0", "e-", f"{value:.4g}")
+    return str(value)
+
+
+if __name__ == "__main__":
+    write_bytes(PAGE, page().encode())
