@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from compgs.config import Config, load_config
+from compgs.entropy.models import OwnResidualsEntropyModel
 from compgs.trained_model import TrainedModel
 from compgs.training.control import GROWTH_LEVELS, make_schedule
 from compgs.training.optimizers import make_optimizer
@@ -132,7 +133,7 @@ def test_an_anchors_residuals_have_one_hyperprior_channel_for_each(paper: Config
     settings = dataclasses.replace(paper.model, coupled_primitives=coupled)
     config = dataclasses.replace(paper, model=settings)
     model = TrainedModel(config, torch.zeros(1, 3, dtype=torch.int32), 1.0, 1.0, (0.0, 0.0, 0.0))
-    assert model.entropy.residual_analysis is not None
+    assert isinstance(model.entropy, OwnResidualsEntropyModel)
     assert model.entropy.residual_analysis.second.out_features == coupled
 
 

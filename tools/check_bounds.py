@@ -3,8 +3,8 @@
     python3 tools/check_bounds.py [--newest]
 
 Installs the project into a new environment with `NAME==LOWEST` for every dependency (or, with --newest, what pip takes
-today), runs tools/check_light.py there, and prints versions and size of what was installed. Needs Python 3.11, for
-which all of the lowest versions have wheels, and the network.
+today), runs tools/check_light.py there, and prints versions and size of what was installed. Needs the network, and a
+Python that the lowest versions have wheels for: 3.11.
 """
 
 import subprocess
@@ -30,9 +30,9 @@ def main() -> None:
         environment = Path(folder, "environment")
         venv.create(environment, with_pip=True)
         python = next(environment.glob("[bS]*/python*"))
-        pip = [str(python), "-m", "pip", "--quiet", "--disable-pip-version-check"]
+        pip = [str(python), "-m", "pip", "--disable-pip-version-check"]
         before = size_of(environment)
-        subprocess.run([*pip, "install", str(ROOT), *wanted], check=True)
+        subprocess.run([*pip, "install", "--quiet", str(ROOT), *wanted], check=True)
         print(f"{(size_of(environment) - before) / 1e6:.0f} MB were installed:")
         subprocess.run([*pip, "list"], check=True)
         subprocess.run(

@@ -2,8 +2,8 @@
 
     python tools/check_light.py FILE FOLDER
 
-FILE is a .cgs with viewpoints; what is written goes to FOLDER, which must be new. Prints how long it took. `make
-bounds` runs it at the lowest versions; the tests run it where torch, scipy and safetensors are hidden.
+FILE is a .cgs with viewpoints; what is written goes to FOLDER, which must be new. Prints how long it took.
+`make bounds` runs it at the lowest versions; the tests run it where torch, scipy and safetensors are hidden.
 """
 
 import shutil
@@ -58,7 +58,7 @@ def main() -> None:
     loaded = {name.partition(".")[0] for name in sys.modules} & {"torch", "scipy", "safetensors"}
     assert not loaded, f"loaded: {loaded}"
     print(
-        f"all of it works: {time.process_time() - start:.0f} s of processor time, kernels compiled where they were not"
+        f"all of it works: {time.process_time() - start:.0f} s of processor time, with compiling what was not yet"
     )
 
 

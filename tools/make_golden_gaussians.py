@@ -1,4 +1,5 @@
-"""Writes tests/golden/gaussians.json: the Gaussians that a camera sees of each golden file, by plain float64.
+"""Writes tests/golden/gaussians.json: the Gaussians that a camera sees of each golden file, by plain float64. And a
+picture NAME.png of files that were trained, from the first of their viewpoints, by the readable rasterizer in float64.
 
     python tools/make_golden_gaussians.py
 
@@ -10,18 +11,26 @@ import json
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from PIL import Image
 
 from compgs.codec.content import FileContent, Latents, Role
+from compgs.codec.decoder import decode
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.codec.reader import read_latents
+from compgs.metrics import to_8bit
+from compgs.render import render
+from compgs.tensors.scenes import HybridOnDevice
 
 ROOT = Path(__file__).parent.parent
 GOLDEN = ROOT / "tests" / "golden"
-sys.path.append(str(ROOT / "tools"))
+sys.path += [str(ROOT / "tools"), str(ROOT / "benchmarks")]
+from make_golden_files import TRAINED  # noqa: E402
 from plain_prediction import CUTOFF, Content, Primitive, is_drawn, primitives  # noqa: E402
 
 FIELDS = ("mean", "scales", "quaternion", "opacity", "color")
@@ -74,6 +83,12 @@ def golden_gaussians(content: Content) -> dict[str, Any]:
     )
 
 
+def golden_picture(path: Path) -> np.ndarray:
+    """[H, W, 3] uint8 from the first viewpoint: networks, projection and blending by plain torch in float64."""
+    model = replace(HybridOnDevice.of(decode(path), torch.device("cpu")), dtype=torch.float64)
+    return to_8bit(render(model, model.viewpoints[0]).image)
+
+
 def _centers(content: Content) -> Iterator[tuple[float, float, float]]:
     """Where to look from: beside the middle of the anchors, in whole voxels, which every precision holds exactly."""
     extent = np.ptp(content.coordinates, axis=0).max() + 4
@@ -102,6 +117,8 @@ def main() -> None:
         content = plain_content(*read_latents((GOLDEN / f"{name}.cgs").read_bytes()))
         pinned[name] = golden_gaussians(content)
         print(f"{name}: {pinned[name]['count']} Gaussians from {pinned[name]['camera_center']}")
+    for name in TRAINED:
+        Image.fromarray(golden_picture(GOLDEN / f"{name}.cgs")).save(GOLDEN / f"{name}.png", optimize=True)
     path = GOLDEN / "gaussians.json"
     temporary = path.with_name(f".{path.name}.partial")
     temporary.write_text(json.dumps(pinned, indent=2) + "\n", encoding="utf-8")

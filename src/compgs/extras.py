@@ -9,6 +9,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "train": ("torch", "scipy", "safetensors"),
     "cuda": ("torch", "gsplat"),
     "reconstruct": ("pycolmap",),
+    "view": ("viser",),
     "cluster": ("ray",),
 }
 

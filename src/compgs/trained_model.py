@@ -5,7 +5,8 @@ Training optimizes it, the encoder turns it into a file, `as_hybrid_model` into 
 
 import copy
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.devices import placed
-from compgs.entropy.models import EntropyModel, Quantized, starting_residuals
+from compgs.entropy.models import Quantized, make_entropy_model
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.head_weights import HeadDimensions
 from compgs.model.hybrid_model import HybridModel
@@ -73,6 +74,17 @@ class SharedResiduals:
         return (residuals * self.step).view(self.shape)
 
 
+@dataclass(frozen=True)
+class ModelDimensions:
+    """Sizes of a model. It begins with those of the settings and may outgrow them: channels that say nothing go."""
+
+    coupled_primitives: int  # K, slots of an anchor; the mask says which exist
+    reference_dim: int
+    residual_dim: int
+    width: int  # hidden, of the prediction networks
+    heads: Literal["separate", "paired"]
+
+
 class TrainedModel(nn.Module):
     """N anchors on a voxel grid with K coupled primitives each.
 
@@ -94,9 +106,11 @@ class TrainedModel(nn.Module):
         distance_unit: float,  # world units, of the view embedding
         background: tuple[float, float, float],
         world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),  # world units, float64
+        *,
+        reference_dim: int | None = None,  # None: that of the settings
     ) -> None:
         super().__init__()
-        m = config.model
+        m = config.model if reference_dim is None else replace(config.model, reference_dim=reference_dim)
         n = len(coordinates)
         self.config = config
         self.voxel_size = voxel_size
@@ -107,7 +121,7 @@ class TrainedModel(nn.Module):
         self.viewpoints: tuple[Camera, ...] = ()
         self.up: tuple[float, float, float] = (0.0, -1.0, 0.0)
         self.heads = make_heads(m.heads, HeadDimensions(m.reference_dim, m.residual_dim, m.width))
-        self.entropy = EntropyModel(m, config.entropy)
+        self.entropy = make_entropy_model(m, config.entropy)
         self.register_buffer("coordinates", coordinates.to(torch.int32))
         self.register_buffer("mask", torch.ones(n, m.coupled_primitives, dtype=torch.bool))
         self.log_scales = nn.Parameter(torch.zeros(n, 6))
@@ -120,7 +134,7 @@ class TrainedModel(nn.Module):
             )
         )
         # [N, K * residual_dim] steps, or [1, K * residual_dim] where all anchors share them
-        self.residuals = nn.Parameter(self.residual_kind.start(starting_residuals(self.entropy, m), n))
+        self.residuals = nn.Parameter(self.residual_kind.start(self.entropy.starting_residuals(), n))
 
     @property
     def anchors(self) -> int:
@@ -130,6 +144,12 @@ class TrainedModel(nn.Module):
     def reference_dim(self) -> int:
         """Channels of the references now: those that came to say nothing are gone."""
         return self.references.shape[1]
+
+    @property
+    def dimensions(self) -> ModelDimensions:
+        """As they are now."""
+        m = self.config.model
+        return ModelDimensions(self.mask.shape[1], self.reference_dim, m.residual_dim, m.width, m.heads)
 
     @property
     def device(self) -> torch.device:
@@ -171,12 +191,10 @@ class TrainedModel(nn.Module):
         rate: bool = False,
         noise: Callable[[Tensor], Tensor] | None = None,
         stored_weights: bool = True,
-        masked: bool = False,
+        mask: Tensor
+        | None = None,  # [V, K] bool: coupled primitives of these anchors whose bits count; default all
     ) -> Quantized:
-        """Quantized latents (in steps) and their bits; see EntropyModel.forward.
-
-        `masked`: bits of those coupled primitives alone that exist.
-        """
+        """Quantized latents (in steps) and their bits; see EntropyModel.forward."""
 
         def chosen(parameter: Tensor) -> Tensor:
             return parameter if rows is None else parameter.index_select(0, rows)
@@ -192,7 +210,7 @@ class TrainedModel(nn.Module):
             rate=rate,
             noise=noise,
             network_bits=self.weights.network if stored_weights else None,
-            mask=chosen(self.mask) if masked else None,
+            mask=mask,
         )
         if e.quantized:
             return latents
@@ -200,14 +218,14 @@ class TrainedModel(nn.Module):
 
     def primitives(self, latents: Quantized, rows: Tensor | None = None) -> Primitives:
         """Dequantize: all K coupled primitives of the given anchors, as prediction sees them."""
-        e, m = self.config.entropy, self.config.model
+        e, d = self.config.entropy, self.dimensions
         n = len(latents.references)
         return Primitives(
             positions=self.positions(rows),
             log_scales=latents.covariances * self.entropy.covariance_step,
             references=latents.references * e.reference_step,
-            residuals=(latents.residuals * e.residual_step).reshape(n * m.coupled_primitives, m.residual_dim),
-            anchor_index=every_slot(n, m.coupled_primitives, self.device),
+            residuals=(latents.residuals * e.residual_step).reshape(-1, d.residual_dim),
+            anchor_index=every_slot(n, d.coupled_primitives, self.device),
             voxel_size=self.voxel_size,
         )
 
@@ -241,8 +259,11 @@ class TrainedModel(nn.Module):
         return placed(model, self.device)
 
     @torch.no_grad()
-    def estimated_bits(self) -> dict[str, float]:
-        """Bits of each stream of the file, by the model's own probabilities (weights and positions not included)."""
-        coded = torch.nonzero(self.mask.any(1)).view(-1)
-        bits = self.quantized(coded, rate=True, masked=True).bits
+    def estimated_bits(self, mask: Tensor | None = None) -> dict[str, float]:
+        """Bits of each stream of the file, by the model's own probabilities (weights and positions not included), if
+        the coupled primitives of `mask` [N, K] bool existed; default: those that do.
+        """
+        mask = self.mask if mask is None else mask
+        coded = torch.nonzero(mask.any(1)).view(-1)
+        bits = self.quantized(coded, rate=True, mask=mask.index_select(0, coded)).bits
         return {name: float(b.sum(dtype=torch.float64)) for name, b in bits.items()}

@@ -147,7 +147,7 @@ DEMO = ["demo-scene", "scene"]
         ([*TRAIN, "--background", "0", "0", "2"], "--background (0.0, 0.0, 2.0): expected three numbers"),
         ([*TRAIN, "--target-size", "5XB"], "--target-size 5XB: expected a size such as 130kB"),
         ([*TRAIN, "--preset", "best"], "--preset 'best' does not exist; there are default, paper, quick"),
-        ([*TRAIN, "--method", "nerf"], "--method: expected one of compgs, 3dgs, found 'nerf'"),
+        ([*TRAIN, "--method", "nerf"], "--method nerf: expected one of compgs, 3dgs"),
         ([*TRAIN, "--method", "3dgs", "--lmbda", "0"], "--lmbda: not a setting of --method 3dgs"),
         ([*TRAIN, "--set", "training.steps=abc"], "--set training.steps=abc: expected a whole number"),
         ([*TRAIN, "--set", "training.rate_start=2"], "--set training.rate_start=2.0: expected 0 to 1"),

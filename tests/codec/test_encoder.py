@@ -4,18 +4,22 @@ import numpy as np
 import pytest
 import torch
 
+from compgs.codec import content as content_module
 from compgs.codec import decode, encode
 from compgs.codec.content import Role, cross_entropy_bits
-from compgs.codec.encoder import integer_network, to_content
-from compgs.codec.integer_network import IntegerNetwork, evaluate
+from compgs.codec.encoder import encoded, integer_network, to_content
+from compgs.codec.integer_network import IntegerNetwork, entropy_parameters, evaluate
 from compgs.codec.reader import file_info, group_names, read_content
+from compgs.codec.writer import write_content
 from compgs.config import Config, EntropyConfig, ModelConfig
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import CorruptSection, NotEncodable, OutputError, TruncatedSection
+from compgs.evaluation.camera_path import orbit
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.stored_weights import SHARED_RESIDUAL_BITS
 from compgs.trained_model import TrainedModel
+from compgs.training.decorrelation import keep_channels
 
 OWN_RESIDUALS = Config(model=ModelConfig(residuals=True))
 
@@ -74,8 +78,6 @@ def test_the_decoded_scene_is_the_one_that_training_rendered(tmp_path, blocks, r
 @pytest.mark.parametrize("blocks", [0, 2])
 def test_bits_match_the_files_sections_within_one_percent(blocks):
     """Streams above 10 kB."""
-    from compgs.codec.writer import write_content
-
     config = replace(OWN_RESIDUALS, entropy=EntropyConfig(network_blocks=blocks, network_width=16))
     model = made_model(7000, config=config)
     with torch.no_grad():
@@ -158,8 +160,6 @@ def test_a_damaged_file_is_named_when_it_is_decoded(tmp_path):
 
 
 def test_heads_of_another_layout_are_refused(tmp_path):
-    from compgs.codec.writer import write_content
-
     content = to_content(made_model())
     renamed = tuple((f"x{name}", tensor) for name, tensor in content.heads)
     path = tmp_path / "a.cgs"
@@ -171,8 +171,6 @@ def test_heads_of_another_layout_are_refused(tmp_path):
 @pytest.mark.parametrize("threads", [1, 2])
 def test_symbols_do_not_depend_on_the_number_of_threads(threads):
     import numba
-
-    from compgs.codec.writer import write_content
 
     limit = numba.config.NUMBA_NUM_THREADS
     if threads > limit:
@@ -214,8 +212,6 @@ def test_own_residuals_leave_no_tensor_of_shared_ones():
 
 
 def test_shared_residuals_of_another_shape_are_refused(tmp_path):
-    from compgs.codec.writer import write_content
-
     content = to_content(made_model(50, config=Config()))
     path = tmp_path / "a.cgs"
     for shape in ((8, 5), (40,)):
@@ -309,3 +305,48 @@ def test_an_entropy_model_of_every_kind_is_written_as_the_paper_has_it():
             assert [layer.rectify for layer in group.prior.layers] == [True, True, False, True, False, False]
             assert [len(layer.bias) for layer in group.prior.layers[:-1]] == [12] * 5
             assert group.prior.skip
+
+
+@pytest.mark.parametrize("config", [OWN_RESIDUALS, Config()])
+def test_each_network_is_evaluated_once_for_each_block_of_rows(config, tmp_path, monkeypatch):
+    seen = []
+
+    def counted(network, x, mask=None):
+        seen.append((id(network), len(x)))
+        return entropy_parameters(network, x, mask)
+
+    monkeypatch.setattr(content_module, "entropy_parameters", counted)
+    model = made_model(900, config=config)  # three ranges in the file
+    encode(model, tmp_path / "a.cgs")
+    assert len({network for network, _ in seen}) == len(seen) == len(model.entropy.coded_networks)
+    assert {rows for _, rows in seen} == {int(model.mask.any(1).sum())}
+
+
+def test_groups_coded_by_the_encoder_are_those_of_a_walk_along_its_content(tmp_path):
+    data, content = encoded(made_model(900))
+    assert data == write_content(content)
+    assert (content.coordinates == read_content(data).coordinates).all(), "in the file's order"
+
+
+def test_encoding_leaves_the_model_as_it_is(tmp_path):
+    model = made_model(100)
+    config, before = model.config, {name: value.clone() for name, value in model.state_dict().items()}
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+    views = tuple(camera for _, camera in orbit(corners, frames=3, width=8, height=8))
+    model.viewpoints = views
+    assert encoded(model, viewpoints=1)[1].viewpoints != encoded(model)[1].viewpoints
+    assert encoded(model, viewpoints=0)[1].viewpoints is None
+    after = model.state_dict()
+    assert model.config is config and model.viewpoints == views and before.keys() == after.keys()
+    assert all(
+        torch.equal(before[name], after[name]) and before[name].dtype == after[name].dtype for name in after
+    )
+
+
+def test_a_model_that_lost_channels_has_its_own_dimensions(tmp_path):
+    model = made_model(100)
+    keep_channels(model, torch.arange(32) % 2 == 0)
+    d = model.dimensions
+    assert (d.reference_dim, d.coupled_primitives, model.config.model.reference_dim) == (16, 5, 32)
+    assert model.entropy.channels["reference"] == 16
+    assert encoded(model)[1].dimensions.reference_dim == 16

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from compgs.codec.anchor_order import canonical_order
 from compgs.codec.reader import file_info, read_content
-from compgs.codec.tmc3 import ASKED_BY, ENCODER_OPTIONS, decode_positions_tmc3, encode_positions_tmc3
+from compgs.codec.tmc3 import (
+    ASKED_BY,
+    ENCODER_OPTIONS,
+    decode_positions_tmc3,
+    encode_positions_tmc3,
+    find_program,
+)
 from compgs.codec.writer import write_content
 from compgs.errors import CorruptSection, MissingDependency, NotEncodable
 
@@ -175,3 +181,15 @@ def test_real_g_pcc_is_lossless(monkeypatch: pytest.MonkeyPatch) -> None:
     points = cloud(3000)
     data = encode_positions_tmc3(points)
     assert (decode_positions_tmc3(data, len(points)) == points[canonical_order(points)]).all()
+
+
+def test_a_program_in_the_current_folder_is_not_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Windows finds it there before it looks at PATH."""
+    folder = tmp_path / "bin"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.setattr("shutil.which", lambda name: f".{os.sep}{name}")
+    with pytest.raises(MissingDependency, match=r"tmc3.*PATH"):
+        find_program()
+    monkeypatch.setattr("shutil.which", lambda name: str(folder / name))
+    assert find_program() == str(folder / "tmc3")

@@ -7,7 +7,7 @@ import torch
 from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy import STREAMS, EntropyModel
 from compgs.entropy.gaussian import gaussian_bits, scale_from_index
-from compgs.entropy.models import starting_residuals
+from compgs.entropy.models import make_entropy_model
 from compgs.entropy.network import EntropyNetwork
 
 MODEL = ModelConfig(coupled_primitives=3, reference_dim=6, residuals=True, residual_dim=4)
@@ -23,7 +23,7 @@ def latents(n=50, seed=0):
 @pytest.fixture(params=[ENTROPY, BLOCKS], ids=["linear", "blocks"])
 def entropy(request):
     torch.manual_seed(0)
-    return EntropyModel(MODEL, request.param)
+    return make_entropy_model(MODEL, request.param)
 
 
 def test_bits_are_given_per_anchor_for_every_stream(entropy):
@@ -161,7 +161,7 @@ def test_a_file_is_estimated_by_the_histograms_of_its_hyperpriors(entropy):
 
 
 def test_a_new_anchor_starts_with_the_residuals_that_the_prior_expects(entropy):
-    start = starting_residuals(entropy, MODEL)
+    start = entropy.starting_residuals()
     assert start.any()
     mean, _ = entropy.residual_network(torch.zeros(1, 9))
     if not entropy.residual_network.blocks:
@@ -237,11 +237,11 @@ def test_readers_of_the_references_are_all_the_weights_that_see_them(entropy):
 def test_anchors_that_share_residuals_pay_for_none_of_them():
     torch.manual_seed(0)
     model = replace(MODEL, residuals=False)
-    entropy = EntropyModel(model, ENTROPY)
-    assert entropy.residual_network is entropy.residual_analysis is entropy.residual_density is None
+    entropy = make_entropy_model(model, ENTROPY)
+    assert type(entropy) is EntropyModel
     assert entropy.coded_networks == (entropy.reference_network, entropy.covariance_network)
     f, c, _ = latents()
-    shared = starting_residuals(entropy, model)
+    shared = entropy.starting_residuals()
     assert shared.shape == (12,) and len(shared.unique()) == 12
     result = entropy(f, c, shared[None], rate=True)
     assert tuple(result.bits) == STREAMS[:3]

@@ -107,7 +107,7 @@ def test_the_least_important_share_goes(data: bytes, cameras: list[Camera], drop
 
 
 def test_of_primitives_that_contribute_alike_the_later_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = torch.tensor([1.0, 0.0, 0.0, 2.0, 0.0, 3.0])
+    found = np.array([1.0, 0.0, 0.0, 2.0, 0.0, 3.0])
     monkeypatch.setattr("compgs.evaluation.reduction.importance", lambda *_: found)
     model = SimpleNamespace(coupled=6)
     assert most_important(model, [], 0.34).tolist() == [True, True, False, True, False, True]

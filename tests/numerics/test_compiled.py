@@ -1,22 +1,19 @@
-"""Kernels are compiled when they are called, by one clock, and parallel ones take turns."""
+"""Kernels are compiled when they are called, by one clock; parallel ones share their work among threads."""
 
-import importlib
 import os
-import subprocess
-import sys
-from pathlib import Path
+import threading
+import time
+from collections.abc import Iterator
 
+import numba
 import numpy as np
 import pytest
-from numba.core.registry import CPUDispatcher
 
-import compgs
 from compgs.cli import compiling as announcing
 from compgs.numerics import kernel_cache
-from compgs.numerics.compiled import ParallelKernel, njit
+from compgs.numerics.compiled import njit, portion
 from compgs.numerics.compiling import COMPILING, CompilingTime, working_seconds
-
-PACKAGE = Path(compgs.__file__).parent
+from compgs.numerics.crew import Crew, Share
 
 
 @pytest.fixture(autouse=True)
@@ -72,54 +69,89 @@ def test_compiling_is_said_once_and_not_for_a_moment(capsys: pytest.CaptureFixtu
     assert capsys.readouterr().out == "compiling, once on this machine\n"
 
 
-# numba's own threads ("workqueue") end the process when a second thread calls while they work.
-TWO_THREADS = """
-import sys, threading
-import numpy as np
-from numba import njit as unlocked, prange, threading_layer
-from compgs.numerics.compiled import njit
-
-def total(x, parts):
-    for i in prange(len(parts)):
-        s = 0.0
-        for j in range(len(x)):
-            s += x[j] * i
-        parts[i] = s
-
-kernel = (njit if sys.argv[1] == "ours" else unlocked)(parallel=True)(total)
-x = np.ones(20_000)
-kernel(x, np.zeros(8))
-def call():
-    for _ in range(50):
-        parts = np.zeros(8)
-        kernel(x, parts)
-        found.append(parts.tolist())
-found = []
-threads = [threading.Thread(target=call) for _ in range(4)]
-for thread in threads: thread.start()
-for thread in threads: thread.join()
-assert found == 200 * [[20_000.0 * i for i in range(8)]]
-print(threading_layer())
-"""
+def test_constants_in_a_call_make_no_kernel_of_their_own() -> None:
+    inner = njit(lambda x, y: x + y)
+    outer = njit(lambda x: inner(x, 3) + inner(x, 4))
+    assert (outer(1), len(inner.overloads)) == (9, 1)
 
 
-def test_parallel_kernels_of_several_threads_take_turns() -> None:
-    variables = os.environ | {"NUMBA_THREADING_LAYER": "workqueue", "NUMBA_NUM_THREADS": "2"}
-    command = [sys.executable, "-c", TWO_THREADS, "ours"]
-    done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stdout.strip()) == (0, "workqueue"), done.stderr
+# ---- parallel kernels
 
 
-def test_no_kernel_without_the_lock_calls_a_parallel_one() -> None:
-    """Inside a kernel nobody takes the lock."""
-    for file in sorted(PACKAGE.rglob("*.py")):
-        text = file.read_text(encoding="utf-8")
-        if "import njit" not in text:
-            continue
-        module = importlib.import_module(
-            ".".join(("compgs", *file.relative_to(PACKAGE).with_suffix("").parts))
+@njit(parallel=True)
+def fill(out, share):
+    for i in portion(len(out), share):
+        out[i] += 10 * share[1] + share[0]
+
+
+@pytest.fixture
+def threads() -> Iterator[int]:
+    """As many as there may be, two at least."""
+    before = numba.get_num_threads()
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("numba was started with one thread")
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    yield numba.get_num_threads()
+    numba.set_num_threads(before)
+
+
+def filled(count: int) -> np.ndarray:
+    out = np.zeros(count, np.int64)
+    fill(out)
+    return out
+
+
+def test_a_parallel_kernel_does_all_of_its_work_once_in_contiguous_shares(threads: int) -> None:
+    for count in (0, 1, threads, 1000):
+        expected = 10 * threads + np.arange(threads).repeat(
+            [count * (i + 1) // threads - count * i // threads for i in range(threads)]
         )
-        for kernel in vars(module).values():
-            if isinstance(kernel, CPUDispatcher) and not isinstance(kernel, ParallelKernel):
-                called = [kernel.py_func.__globals__.get(name) for name in kernel.py_func.__code__.co_names]
-                assert not any(isinstance(other, ParallelKernel) for other in called), kernel
+        assert filled(count).tolist() == expected.tolist()
+
+
+def test_on_one_thread_there_is_one_share() -> None:
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        assert filled(5).tolist() == [10] * 5
+    finally:
+        numba.set_num_threads(before)
+
+
+def test_several_threads_may_call_parallel_kernels_at_once(threads: int) -> None:
+    def call() -> None:
+        results.extend(filled(100).sum() for _ in range(200))
+
+    results: list[int] = []
+    callers = [threading.Thread(target=call) for _ in range(4)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    assert results == 800 * [filled(100).sum()]
+
+
+def test_an_error_in_any_share_reaches_the_caller_when_all_shares_have_ended() -> None:
+    ended = []
+
+    def work(share: Share) -> None:
+        if share[0] == failing:
+            raise ValueError(f"share {share[0]}")
+        time.sleep(0.05)
+        ended.append(share[0])
+
+    for failing in range(3):
+        ended.clear()
+        with pytest.raises(ValueError, match=f"share {failing}"):
+            Crew().do(work, 3)
+        assert sorted(ended) == [i for i in range(3) if i != failing]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system does not fork")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_parallel_kernels_run_in_forked_processes(threads: int) -> None:
+    total = filled(100).sum()
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if filled(100).sum() == total else 1)
+    assert os.waitpid(child, 0)[1] == 0

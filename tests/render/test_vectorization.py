@@ -1,25 +1,29 @@
 """The inner loops must be compiled to vector instructions: losing them is silent and costs a factor of ten.
 
-The sources of the kernels are compiled afresh (cached kernels show no assembly), without threads.
+The sources of the kernels are compiled afresh: cached kernels show no assembly.
 """
 
 import platform
 import re
 
 import pytest
-from numba import float32, int32, int64, njit
+from numba import float32, int32, int64, njit, types
 
 from compgs.render import projection, tiles
 
 F1, F2, F3 = float32[::1], float32[:, ::1], float32[:, :, ::1]
 LIMITS = (float32, float32, float32)
+SHARE = types.UniTuple(int64, 2)
 KERNELS = {
-    "project_forward": (projection, (F2, F2, F2, F1, F2, F2, F1, F1)),
-    "project_backward": (projection, (F2, F2, F2, F1, F1, F2, F2, F2, F2, F2)),
-    "blend_forward": (tiles, (F2, int64[::1], int32[:, ::1], int32[::1], F1, *LIMITS, F3, F2, int64[::1])),
+    "project_forward": (projection, (F2, F2, F2, F1, F2, F2, F1, F1, SHARE)),
+    "project_backward": (projection, (F2, F2, F2, F1, F1, F2, F2, F2, F2, F2, SHARE)),
+    "blend_forward": (
+        tiles,
+        (F2, int64[::1], int32[:, ::1], int32[::1], F1, *LIMITS, F3, F2, int64[::1], SHARE),
+    ),
     "blend_backward": (
         tiles,
-        (F2, int64[::1], int32[:, ::1], int32[::1], int64[::1], *LIMITS, F3, F2, F3, F2, F2),
+        (F2, int64[::1], int32[:, ::1], int32[::1], int64[::1], *LIMITS, F3, F2, F3, F2, F2, SHARE),
     ),
 }
 # mul, fma and their variants; "ps" is packed, "ss" scalar

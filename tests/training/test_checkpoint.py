@@ -6,7 +6,7 @@ import torch
 
 from compgs.errors import CheckpointError
 from compgs.interrupt import Terminated, ended_on_request, held_back
-from compgs.training.checkpoint import load_checkpoint
+from compgs.training.checkpoint import load_checkpoint, read_checkpoint_file, write_checkpoint_file
 from compgs.training.loop import Pace
 from compgs.training.trainer import Trainer
 
@@ -207,3 +207,13 @@ def test_the_pace_is_that_of_the_steps_without_compilation_and_checkpoints(monke
     assert pace.look() == pytest.approx(0.11)
     steps(10, 0.02)
     assert pace.look() == pytest.approx(0.02)
+
+
+def test_what_was_read_does_not_hold_the_file(tmp_path):
+    """A file that is mapped cannot be replaced on Windows; here its tensors would change with it."""
+    path = tmp_path / "checkpoint.safetensors"
+    write_checkpoint_file(path, "compgs", {"model/a": torch.arange(4096.0)}, {})
+    tensors, _ = read_checkpoint_file(path, "compgs")
+    with path.open("r+b") as file:
+        file.write(b"\0" * path.stat().st_size)
+    assert torch.equal(tensors["model/a"], torch.arange(4096.0))

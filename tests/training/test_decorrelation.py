@@ -284,6 +284,21 @@ def test_the_channels_that_stay_keep_their_means_and_scales(blob_scene: Scene, t
     assert torch.equal(trainer.optimizer.state[network.weights[-1]]["exp_avg"], moments[rows])
 
 
+@pytest.mark.parametrize("heads", ["paired", "separate"])
+def test_with_fewer_channels_a_model_looks_in_memory_as_it_does_from_its_file(
+    blob_scene: Scene, tiny_config: Config, tmp_path: Path, heads: str
+) -> None:
+    config = replace(tiny_config, model=replace(tiny_config.model, heads=heads))
+    trainer = trained(blob_scene, config, steps=8)
+    kept = torch.tensor([False, True, False, True, True, True, True, True])
+    keep_channels(trainer.model, kept, trainer.optimizer)
+    model = trainer.model.as_hybrid_model()
+    assert model.heads.dimensions.reference == 6
+    encode(trainer.model, tmp_path / "a.cgs")
+    for mine, decoded in zip(model.geometry, decode(tmp_path / "a.cgs").geometry, strict=True):
+        np.testing.assert_allclose(np.sort(mine, axis=0), np.sort(decoded, axis=0), rtol=1e-3, atol=1e-3)
+
+
 def test_one_channel_stays_when_none_says_anything(blob_scene: Scene, tiny_config: Config) -> None:
     trainer = trained(blob_scene, tiny_config, steps=1)
     with torch.no_grad():

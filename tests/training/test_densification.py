@@ -104,9 +104,9 @@ def test_splats_are_judged_by_their_mean_gradient_over_the_views_that_drew_them(
     control = DensityControl(SplatConfig(gradient_threshold=1.0), EXTENT, 4, CPU)
     control.gradient[:] = torch.tensor([9.0, 1.1, 0.9, 11.0])
     control.seen[:] = torch.tensor([10.0, 1.0, 0.0, 10.0])
-    optimizer = after_one_step(parameters, SplatConfig())
-    control.act(parameters, optimizer, torch.Generator().manual_seed(0), remove_large=False)
-    assert torch.equal(parameters.dc[4:], before.dc[[1, 3]])
+    kept, added, origins = control.chosen(before, before, torch.Generator(), remove_large=False)
+    assert kept.all() and origins.tolist() == [1, 3]
+    assert torch.equal(added.dc, before.dc[[1, 3]])
 
 
 def test_parts_are_spread_as_their_parent_is():

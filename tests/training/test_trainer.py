@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from compgs.entropy import EntropyModel
 from compgs.errors import ConfigError, TrainingError
 from compgs.gaussians import Gaussians
 from compgs.metrics import psnr, to_8bit
@@ -138,6 +139,23 @@ def test_views_that_all_look_elsewhere_are_an_error_before_any_step(blob_scene, 
         train(scene, tiny_config)
 
 
+def test_progress_tells_the_quality_of_the_view_that_was_trained_on(blob_scene, tiny_config, monkeypatch):
+    trainer = Trainer(blob_scene, tiny_config, CPU)
+    results, step, told = [], trainer.train_step, []
+    monkeypatch.setattr(trainer, "train_step", lambda: results.append(step()) or results[-1])
+
+    def tell(status):
+        result = results[-1]
+        error = result.image.clamp(0, 1).double() - result.photograph.image.double() / 255
+        told.append((status.psnr, -10 * float(error.square().mean().log10())))
+        assert status.loss == pytest.approx(float(result.loss))
+
+    trainer.run(None, tell)
+    assert len(told) == 4
+    for found, expected in told:
+        assert found == pytest.approx(expected, abs=1e-3)
+
+
 def test_no_training_views_is_a_settings_error(blob_scene, tiny_config):
     with pytest.raises(ConfigError, match="no training views"):
         train(replace(blob_scene, train_views=()), tiny_config)
@@ -178,7 +196,7 @@ def test_without_residual_embeddings_all_anchors_have_the_same_and_the_file_has_
     shared = trainer.model.shared_residuals().detach()
     assert shared.shape == (config.model.coupled_primitives, config.model.residual_dim)
     assert not torch.equal(shared, start), "they learn"
-    assert trainer.model.entropy.residual_network is None
+    assert type(trainer.model.entropy) is EntropyModel
     encode(trainer.model, tmp_path / "a.cgs")
     names = [s.name for s in file_info((tmp_path / "a.cgs").read_bytes()).sections]
     assert not [name for name in names if name.startswith("residual")]
@@ -198,9 +216,9 @@ def test_unquantized_latents_are_rendered_as_they_are(blob_scene, tiny_config):
     shown = model.as_hybrid_model(stored_weights=False).primitives
     kept = model.mask.view(-1)
     step = config.entropy.reference_step
-    assert torch.equal(shown.references, model.references.detach() * step)
+    assert np.array_equal(shown.references, model.references.detach() * step)
     flat = model.residuals.detach().view(len(kept), -1)
-    assert torch.equal(shown.residuals, flat[kept] * config.entropy.residual_step)
+    assert np.array_equal(shown.residuals, flat[kept] * config.entropy.residual_step)
 
 
 def test_primitives_that_add_least_are_left_out_up_to_their_share():

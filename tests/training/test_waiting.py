@@ -10,7 +10,9 @@ import pytest
 import torch
 
 from compgs.config import Config
-from compgs.render import RasterResult, visible_mask
+from compgs.render import RasterResult
+from compgs.tensors.visibility import visible_mask
+from compgs.training import loop as loop_module
 from compgs.training import trainer as trainer_module
 from compgs.training.optimizers import adam_rows
 from compgs.training.trainer import Trainer
@@ -30,14 +32,14 @@ def rasterize_nothing(gaussians, camera, settings) -> RasterResult:
 def valueless_trainer(scene, config: Config, monkeypatch) -> Trainer:
     trainer = Trainer(scene, config, torch.device("cpu"))
     trainer.model.to(META)
-    trainer.device = META
+    trainer.device = trainer.views.device = META
     trainer.noise.pool = trainer.noise.pool.to(META)
     for name in trainer.control.STATISTICS:
         setattr(trainer.control, name, getattr(trainer.control, name).to(META))
     trainer.optimizer = torch.optim.SGD(trainer.optimizer.param_groups, lr=1e-3)
     rows = torch.arange(trainer.model.anchors // 2, device=META)
     monkeypatch.setattr(Trainer, "visible_anchors", lambda self, camera: rows)
-    monkeypatch.setattr(trainer_module, "rasterize", rasterize_nothing)
+    monkeypatch.setattr(loop_module, "rasterize", rasterize_nothing)
     return trainer
 
 

@@ -82,10 +82,10 @@ def test_a_training_comes_out_the_same_whether_it_is_looked_at_or_not(
     assert watched.steps == list(range(1, 25)) and len(watched.page.pictures) >= 20
     assert {picture.full for picture in watched.page.pictures} == {True, False}
     for name, value in state(alone).items():
-        assert torch.equal(value, state(looked_at)[name]), name
+        np.testing.assert_array_equal(np.asarray(value), np.asarray(state(looked_at)[name]), name)
 
 
-def state(model: object) -> dict[str, torch.Tensor]:
+def state(model: object) -> dict[str, object]:
     return dict(model.state_dict()) if isinstance(model, torch.nn.Module) else dict(vars(model.splats))  # type: ignore[attr-defined]
 
 
@@ -104,7 +104,7 @@ def test_a_snapshot_stays_as_it_was_taken(blob_scene: Scene, tiny_config: Config
     train(blob_scene, config, method=method, device="cpu", watch=look)
     for draw, before in zip(taken, seen, strict=True):
         np.testing.assert_array_equal(draw(), before)
-    assert (seen[0] != seen[-1]).any()
+    assert len({image.tobytes() for image in seen}) > 2  # there is something to see, and it changes
 
 
 def test_pictures_at_rest_are_of_now_and_moving_ones_of_the_last_snapshot(blob_scene: Scene) -> None:

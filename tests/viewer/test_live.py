@@ -55,7 +55,8 @@ def visit(browser: str, cgs_bytes: bytes, tmp_path_factory: pytest.TempPathFacto
         with tab(browser, folder / "browser", WIDTH, HEIGHT) as page:
             page.open(f"{viewer.address}?fixedDpr=1")  # software WebGL is slow, and would get fewer pixels
             controls = until(lambda: next(iter(viewer.controls.values()), None), "a visitor")
-            until(lambda: "drawn" in controls.facts.content, "a picture")
+            # kernels may have to be compiled
+            until(lambda: "drawn" in controls.facts.content, "a picture", 300)
             yield Visit(viewer, page, controls)
     finally:
         viewer.close()

@@ -8,7 +8,8 @@ import torch
 
 import compgs
 from compgs.formats import write_ply
-from compgs.model.splats import SplatModel, Splats
+from compgs.model.splats import SplatModel
+from compgs.tensors.splats import Splats
 from compgs.viewer.overlays import MOST_POINTS, anchor_points, ellipsoids, shown_cameras, sphere
 from compgs.viewer.shown import FileShown, focus, radius
 
@@ -21,7 +22,7 @@ def splat_scene(means: np.ndarray, scales: np.ndarray, opacities: np.ndarray) ->
     turned = torch.tensor([2.0, 0.0, 0.0, 2.0]).repeat(n, 1)  # a quarter turn about z, not of unit length
     logits = torch.logit(torch.from_numpy(opacities).float())
     return SplatModel(
-        Splats(*numbers, turned, logits, torch.full((n, 3), 0.5), torch.zeros(n, 0, 3)), (0, 0, 0)
+        Splats(*numbers, turned, logits, torch.full((n, 3), 0.5), torch.zeros(n, 0, 3)).arrays(), (0, 0, 0)
     )
 
 
@@ -58,7 +59,7 @@ def test_there_are_never_more_points_than_a_page_can_show() -> None:
 
 def test_points_are_the_anchors_of_a_file(tiny_cgs: Path) -> None:
     model = compgs.decode(tiny_cgs)
-    np.testing.assert_array_equal(anchor_points(model), model.primitives.positions.numpy())
+    np.testing.assert_array_equal(anchor_points(model), model.primitives.positions)
 
 
 def test_no_more_frustums_than_can_be_told_apart() -> None:

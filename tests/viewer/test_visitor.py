@@ -73,7 +73,7 @@ def visiting(shown: FileShown) -> Iterator[tuple[Visitor, StandIn]]:
 
 
 def until(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + 60
+    end = time.monotonic() + 300  # kernels may have to be compiled
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.005)

@@ -126,14 +126,14 @@ def expected(data: bytes) -> tuple[dict[str, Any], bytes]:
         assert part.stands_for is not None
         prefixes[end] = hashes(part, part_latents) | {"stands_for": part.stands_for.tolist()}
     views = content.viewpoints
-    model = from_latents(content, latents, "cpu")
+    model = from_latents(content, latents)
     camera = _camera(content)
     found, index = model.drawn(camera.moved(content.world_offset))
-    values = {name: getattr(found, name).double().numpy() for name in FIELDS}
+    values = {name: getattr(found, name).astype(np.float64) for name in FIELDS}
     drawn = _sound(values)
     arrays = [values[name][drawn].astype("<f4") for name in FIELDS]
     p = model.primitives
-    arrays.append(p.sizes[p.anchor_index[index]].numpy()[drawn].astype("<f4"))
+    arrays.append(p.spread()[p.anchor_index[index], 3:][drawn].astype("<f4"))
     return {
         "hashes": hashes(content, latents),
         "prefixes": prefixes,

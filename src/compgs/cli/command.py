@@ -38,17 +38,22 @@ class ComputingCommand(Command):
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint=NO_DEFAULT)] = None
     """Where to compute; a CUDA GPU by default where there is one."""
 
-    def prepare(self) -> None:
-        """Apply `threads`, check `device`. Raises UsageError, ConfigError."""
+    def prepare(self, *stages: str) -> None:
+        """Apply `threads`, check `device`; let helpers compile what some stages of work need, where nothing has been
+        compiled yet. Raises UsageError, ConfigError."""
+        if self.threads != 1 and self.device in (None, "cpu"):
+            from compgs.numerics.ahead import start_helpers
+
+            start_helpers(*stages)
         if self.threads is not None:
             use_threads(self.threads)
         if self.device is not None:
             check_device(self.device)
 
-    def prepare_training(self) -> None:
+    def prepare_training(self, *stages: str) -> None:
         """`prepare`, for what trained models need. Raises MissingDependency without torch, too."""
         require("train", "training")
-        self.prepare()
+        self.prepare(*stages)
         if self.threads is not None:
             import torch
 
@@ -62,9 +67,9 @@ class DecodingCommand(ComputingCommand):
     tmc3: FlagCreatePairsOff[bool] = False
     """Let the program tmc3 from PATH decode anchor positions that a file has by G-PCC."""
 
-    def prepare(self) -> None:
-        """Apply `threads` and `tmc3`, check `device`. Raises UsageError, ConfigError."""
-        super().prepare()
+    def prepare(self, *stages: str) -> None:
+        """Apply `threads` and `tmc3`, check `device`; start helpers. Raises UsageError, ConfigError."""
+        super().prepare(*stages)
         if self.tmc3:
             allow_tmc3()
 

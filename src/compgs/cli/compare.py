@@ -64,7 +64,7 @@ class Compare(ComputingCommand, ReadingOptions):
             check_scene(file)
         if self.output is not None:
             check_output_folder(self.output, overwrite=self.overwrite)
-        self.prepare()
+        self.prepare("decode", "render")
         from compgs.evaluation import compare
         from compgs.evaluation.comparison import PAGE_NAME
 

@@ -52,7 +52,7 @@ class Decode(DecodingCommand, FileArgument):
         prefix = None if self.prefix is None else parse_prefix(self.prefix, self.file)
         if self.output is not None:
             check_output_folder(self.output, overwrite=self.overwrite)
-        self.prepare()
+        self.prepare("decode")
         from compgs.codec import decode
 
         start = working_seconds()

@@ -77,9 +77,9 @@ class Encode(DecodingCommand, ReadingOptions):
     def run(self) -> None:
         path = self.check()
         if self.source.is_dir():
-            self.prepare_training()
+            self.prepare_training("encode")
         else:
-            self.prepare()
+            self.prepare("decode")
         start = time.perf_counter()
         data = self.encoded_run() if self.source.is_dir() else read_bitstream(self.source)
         if self.reduces:
@@ -134,15 +134,11 @@ class Encode(DecodingCommand, ReadingOptions):
         return self.output
 
     def encoded_run(self) -> bytes:
-        from compgs.codec.encoder import to_content
-        from compgs.codec.writer import write_content
+        from compgs.codec.encoder import encoded
         from compgs.training import load_run
 
-        model = load_run(self.source)
-        if self.cameras is not None:
-            training = replace(model.config.training, viewpoints=parse_cameras(self.cameras))
-            model.config = replace(model.config, training=training)
-        return write_content(to_content(model), self.geometry)
+        viewpoints = None if self.cameras is None else parse_cameras(self.cameras)
+        return encoded(load_run(self.source), self.geometry, viewpoints=viewpoints)[0]
 
     def reduced(self, data: bytes) -> bytes:
         from compgs.evaluation.reduction import reduce_file

@@ -58,7 +58,7 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
         source = self.source_of_run(run.scene) if run and whole else self.scene_source()
         if run and (otherwise := read_otherwise(run.scene, source)):
             warn(f"{file} was trained with {otherwise}")
-        self.prepare()
+        self.prepare("decode", "render")
         if self.lpips:
             check_lpips()
         from compgs.evaluation import evaluate

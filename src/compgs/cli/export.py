@@ -64,7 +64,7 @@ class Export(DecodingCommand, SceneFileArgument):
         from compgs.formats import check_scene
 
         check_scene(self.file)
-        self.prepare()
+        self.prepare("decode", "render")
         from compgs.exporting import export
 
         with settings_of_options(), counting("baking and comparing") as progress:

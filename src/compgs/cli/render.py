@@ -108,7 +108,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
         if self.cameras is not None and (self.scene or self.source):
             raise UsageError("both a scene and --cameras were given; give one")
         keyframes = self.keyframes()
-        self.prepare()
+        self.prepare("decode", "render")
         from compgs.devices import chosen_device
 
         source = self.views_source(run)

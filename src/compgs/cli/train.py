@@ -157,7 +157,7 @@ class Train(ComputingCommand, SceneOptions):
         folder = self.output
         check_output_folder(folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES)
         settings = self.settings(folder)
-        self.prepare_training()
+        self.prepare_training("train", "encode", "decode", "render")
         if self.lpips:
             check_lpips()
         if self.viewer:

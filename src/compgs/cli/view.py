@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneFileOrRunArgument
+from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileOrRunArgument
 from compgs.cli.console import say
 from compgs.cli.run_folder import file_and_run
 from compgs.cli.usage import UsageError
@@ -16,7 +16,7 @@ from compgs.cli.viewing import check_viewing, listening
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(ComputingCommand, SceneFileOrRunArgument):
+class View(DecodingCommand, SceneFileOrRunArgument):
     """Show a file of splats in the browser: walk around in it, look behind it, record a flight.
 
     This process renders what each visitor sees, exactly: small pictures while the camera moves, one at the window's
@@ -56,7 +56,7 @@ class View(ComputingCommand, SceneFileOrRunArgument):
 
         file, _ = file_and_run(self.file)
         check_scene(file)
-        self.prepare()
+        self.prepare("decode", "render")
         from compgs.devices import chosen_device
         from compgs.viewer.shown import FileShown
         from compgs.viewer.stage import OwnThread

@@ -22,7 +22,6 @@ from enum import IntEnum
 from typing import Literal
 
 import numpy as np
-from numba import prange
 
 from compgs.codec.anchor_order import octree_depth, octree_origin
 from compgs.codec.integer_network import FRACTION_BITS, IntegerNetwork, entropy_parameters, first_rows
@@ -30,7 +29,7 @@ from compgs.codec.rans import escape_bits
 from compgs.codec.tables import FrequencyTables, HyperTable, channel_tables, gaussian_tables
 from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 
 LOG_SCALES = 6  # of an anchor: reach of the offsets, size of the primitives
 COORDINATES = 3  # inputs of a network that sees where its anchor is
@@ -220,14 +219,14 @@ def scatter_existing(existing: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [
 
 
 @njit(parallel=True)
-def _add_steps(symbols, means):
-    for i in prange(len(symbols)):
+def _add_steps(symbols, means, share):
+    for i in portion(len(symbols), share):
         means[i] += symbols[i] << FRACTION_BITS
 
 
 @njit(parallel=True)
-def _move_rows(slots, existing, mask, rows, gather):
-    for n in prange(len(mask)):
+def _move_rows(slots, existing, mask, rows, gather, share):
+    for n in portion(len(mask), share):
         row = rows[n]
         for k in range(mask.shape[1]):
             if not mask[n, k]:

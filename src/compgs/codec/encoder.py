@@ -14,14 +14,28 @@ import torch
 from torch import Tensor, nn
 
 from compgs import __version__
-from compgs.codec.content import LOG_SCALES, FileContent, Group, GroupShape, Role
-from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork, evaluate
+from compgs.codec.anchor_order import canonical_order
+from compgs.codec.content import (
+    LOG_SCALES,
+    CodedGroup,
+    FileContent,
+    Group,
+    GroupShape,
+    Role,
+    conditional_tables,
+    coordinate_context,
+    fixed_point,
+    reconstruct,
+    scatter_existing,
+)
+from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork
 from compgs.codec.tables import HyperTable, hyper_tables
 from compgs.codec.viewpoint_cameras import viewpoints_from_cameras
 from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 from compgs.codec.writer import Geometry, write_content
 from compgs.entropy.factorized import FactorizedDensity
+from compgs.entropy.models import OwnResidualsEntropyModel
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import NotEncodable
@@ -57,114 +71,138 @@ def encode(
         )
     path = Path(path)
     check_output_file(path, overwrite=overwrite)
-    content = to_content(model)
-    data = write_content(content, geometry)
+    data, content = encoded(model, geometry)
     write_bytes(path, data)
     return EncodedFile(path, len(data), len(content.coordinates), int(content.mask.sum()))
 
 
-@torch.no_grad()
+def encoded(
+    model: TrainedModel, geometry: Geometry = "octree", *, viewpoints: int | None = None
+) -> tuple[bytes, FileContent]:
+    """The bytes of a file, and what is in it. `viewpoints`: cameras to keep; by default as many as the model's settings
+    say. Raises NotEncodable, MissingDependency.
+    """
+    content, coded = _coded_model(model, viewpoints)
+    return write_content(content, geometry, coded=coded), content
+
+
 def to_content(model: TrainedModel) -> FileContent:
-    """Everything that goes into the file, as integers. Anchors without a coupled primitive are left out."""
-    m, entropy = model.config.model, model.entropy
+    """Everything that goes into the file, as integers, in the file's order. Anchors without a coupled primitive are
+    left out. Raises NotEncodable.
+    """
+    return _coded_model(model, None)[0]
+
+
+@torch.no_grad()
+def _coded_model(model: TrainedModel, viewpoints: int | None) -> tuple[FileContent, list[CodedGroup]]:
+    """Each network is evaluated once, and the model stays as it is."""
     for name, parameter in model.named_parameters():
         if not torch.isfinite(parameter).all():
             raise NotEncodable(f"{name} holds values that are not finite: the training has diverged")
-    kept = model.mask.any(1).cpu()
-    if not kept.any():
+    kept = torch.nonzero(model.mask.any(1)).view(-1).cpu()
+    if not len(kept):
         raise NotEncodable("no coupled primitive exists: there is nothing to encode")
-    mask = model.mask.cpu()[kept].numpy()
-
-    def rows(parameter: Tensor) -> Tensor:
-        return parameter.detach().cpu()[kept].double()
-
-    steps = entropy.covariance_step.detach().cpu().numpy().astype(np.float32)
-    groups = _reference_groups(model, rows(model.references))
-    references = groups[-1].latents
-    scales = rows(model.log_scales) / torch.from_numpy(steps.astype(np.float64))
-    shape = GroupShape(Role.LOG_SCALES, LOG_SCALES, tuple(map(float, steps)), (len(groups) - 1,))
-    groups.append(_coded(shape, scales, [references], entropy.covariance_network, model.weights.network))
-    if m.residuals:
-        groups += _residual_groups(model, rows(model.residuals), references, first=len(groups))
-    slots = (m.coupled_primitives, m.residual_dim)
-    return FileContent(
-        coupled_primitives=m.coupled_primitives,
-        residual_dim=m.residual_dim,
-        heads_layout=m.heads,
-        width=m.width,
+    kept = kept[torch.from_numpy(canonical_order(model.coordinates.cpu()[kept].numpy()))]
+    coordinates, mask = model.coordinates.cpu()[kept].numpy(), model.mask.cpu()[kept].numpy()
+    d = model.dimensions
+    chain = _Chain(mask, coordinate_context(coordinates), model.weights.network)
+    for code in (_code_references, _code_log_scales, _code_residuals):
+        code(chain, model, kept)
+    content = FileContent(
+        coupled_primitives=d.coupled_primitives,
+        residual_dim=d.residual_dim,
+        heads_layout=d.heads,
+        width=d.width,
         voxel_size=model.voxel_size,
         world_offset=model.world_offset,
         view_distance_scale=model.distance_unit,
         background=model.background,
-        coordinates=model.coordinates.cpu()[kept].numpy(),
+        coordinates=coordinates,
         mask=mask,
-        groups=tuple(
-            Group(
-                coded.shape,
-                coded.prior,
-                coded.symbols.reshape(-1, *slots) * mask[:, :, None]
-                if coded.shape.role == Role.RESIDUAL
-                else coded.symbols,
-            )
-            for coded in groups
-        ),
+        groups=tuple(chain.groups),
         heads=tuple(
             (name, quantized_tensor(tensor, model.weights.bits(name, tensor)))
             for name, tensor in model.head_tensors().items()
         ),
-        viewpoints=_viewpoints(model),
+        viewpoints=_viewpoints(model, viewpoints),
         metadata={"creator": f"compgs {__version__}"},
     )
+    return content, chain.coded
 
 
-def _viewpoints(model: TrainedModel) -> Viewpoints | None:
-    cameras = model.viewpoints[: model.config.training.viewpoints]
+def _viewpoints(model: TrainedModel, count: int | None) -> Viewpoints | None:
+    cameras = model.viewpoints[: model.config.training.viewpoints if count is None else count]
     return viewpoints_from_cameras(cameras, model.up, model.world_offset) if cameras else None
 
 
-@dataclass(frozen=True)
-class _Coded:
-    """A group before the mask: symbols and latents (Q12) [N, channels of an anchor]."""
+class _Chain:
+    """The groups of a file one after the other, each coded given the ones before."""
 
-    shape: GroupShape
-    prior: IntegerNetwork | tuple[HyperTable, ...]
-    symbols: np.ndarray
-    latents: np.ndarray
+    def __init__(self, mask: np.ndarray, places: np.ndarray, network_bits: int) -> None:
+        self.mask = mask  # [N, K] bool
+        self.places = places  # [N, 3] Q12
+        self.network_bits = network_bits
+        self.groups: list[Group] = []
+        self.coded: list[CodedGroup] = []
+
+    def add_side(self, analysis: nn.Module, density: FactorizedDensity, y: Tensor) -> int:
+        """A hyperprior of the latents y [N, C]; its number."""
+        # In float64, so that a symbol does not depend on how many anchors are analyzed together.
+        symbols = _symbols(copy.deepcopy(analysis).cpu().double()(y))
+        tables = hyper_tables(density.probabilities().double().cpu().numpy(), symbols)
+        return self._add(GroupShape(Role.SIDE, symbols.shape[1]), tables, symbols.astype(np.float64))
+
+    def add(self, shape: GroupShape, network: EntropyNetwork, y: Tensor) -> int:
+        """Latents y [N, channels], in quantization steps; with RESIDUAL those of all K slots. The group's number."""
+        latents = y.numpy()
+        if shape.role == Role.RESIDUAL:
+            latents = latents.reshape(*self.mask.shape, shape.channels)[self.mask]
+        return self._add(shape, integer_network(network, self.network_bits), latents)
+
+    def _add(self, shape: GroupShape, prior: IntegerNetwork | tuple[HyperTable, ...], y: np.ndarray) -> int:
+        """`y` [N, channels] float64; with RESIDUAL [P, channels], of the coupled primitives that exist."""
+        before = [group.latents for group in self.coded]
+        means, index, tables = conditional_tables(shape, prior, before, self.places, self.mask)
+        symbols = np.rint(y if means is None else y - means / ONE).astype(np.int32)
+        latents = fixed_point(symbols) if means is None else reconstruct(symbols, means)
+        self.coded.append(CodedGroup(symbols, index, tables, latents))
+        slots = scatter_existing(symbols, self.mask) if shape.role == Role.RESIDUAL else symbols
+        self.groups.append(Group(shape, prior, slots))
+        return len(self.groups) - 1
 
 
-def _reference_groups(model: TrainedModel, f: Tensor) -> list[_Coded]:
-    e, entropy = model.config.entropy, model.entropy
-    side = _hyperprior(entropy.reference_analysis, entropy.reference_density, f)
-    shape = GroupShape(Role.REFERENCE, f.shape[1], (_float32(e.reference_step),), (0,))
-    return [side, _coded(shape, f, [side.latents], entropy.reference_network, model.weights.network)]
+def _code_references(chain: _Chain, model: TrainedModel, kept: Tensor) -> None:
+    entropy, f = model.entropy, _rows(model.references, kept)
+    side = chain.add_side(entropy.reference_analysis, entropy.reference_density, f)
+    steps = (_float32(model.config.entropy.reference_step),)
+    chain.add(GroupShape(Role.REFERENCE, f.shape[1], steps, (side,)), entropy.reference_network, f)
 
 
-def _residual_groups(model: TrainedModel, g: Tensor, references: np.ndarray, first: int) -> list[_Coded]:
-    """`first`: number of the first of these groups in the file."""
-    m, e, entropy = model.config.model, model.config.entropy, model.entropy
-    assert entropy.residual_analysis is not None and entropy.residual_density is not None
-    assert entropy.residual_network is not None
-    side = _hyperprior(entropy.residual_analysis, entropy.residual_density, g)
-    shape = GroupShape(Role.RESIDUAL, m.residual_dim, (_float32(e.residual_step),), (1, first))
-    context = [references, side.latents]
-    return [side, _coded(shape, g, context, entropy.residual_network, model.weights.network)]
+def _code_log_scales(chain: _Chain, model: TrainedModel, kept: Tensor) -> None:
+    entropy = model.entropy
+    steps = entropy.covariance_step.detach().cpu().numpy().astype(np.float32)
+    scales = _rows(model.log_scales, kept) / torch.from_numpy(steps.astype(np.float64))
+    context = (len(chain.groups) - 1,)
+    shape = GroupShape(Role.LOG_SCALES, LOG_SCALES, tuple(map(float, steps)), context)
+    chain.add(shape, entropy.covariance_network, scales)
 
 
-def _hyperprior(analysis: nn.Module, density: FactorizedDensity, y: Tensor) -> _Coded:
-    # In float64, so that a symbol does not depend on how many anchors are analyzed together.
-    symbols = _symbols(copy.deepcopy(analysis).cpu().double()(y))
-    tables = hyper_tables(density.probabilities().double().cpu().numpy(), symbols)
-    return _Coded(GroupShape(Role.SIDE, symbols.shape[1]), tables, symbols, symbols * ONE)
+def _code_residuals(chain: _Chain, model: TrainedModel, kept: Tensor) -> None:
+    """Nothing where all anchors share them: they are in the section of heads."""
+    entropy = model.entropy
+    if not isinstance(entropy, OwnResidualsEntropyModel):
+        return
+    g = _rows(model.residuals, kept)
+    references = next(i for i, group in enumerate(chain.groups) if group.shape.role == Role.REFERENCE)
+    side = chain.add_side(entropy.residual_analysis, entropy.residual_density, g)
+    steps = (_float32(model.config.entropy.residual_step),)
+    shape = GroupShape(Role.RESIDUAL, model.dimensions.residual_dim, steps, (references, side))
+    chain.add(shape, entropy.residual_network, g)
 
 
-def _coded(
-    shape: GroupShape, y: Tensor, context: list[np.ndarray], network: EntropyNetwork, bits: int
-) -> _Coded:
-    """Symbols of y [N, C], in quantization steps, given the latents that the decoder has by then."""
-    prior = integer_network(network, bits)
-    mean = evaluate(prior, np.concatenate(context, 1))[:, : y.shape[1]]
-    symbols = np.rint(y.numpy() - mean / ONE).astype(np.int32)
-    return _Coded(shape, prior, symbols, symbols * ONE + mean)
+def _rows(parameter: Tensor, kept: Tensor) -> Tensor:
+    """[len(kept), C] float64 on the CPU."""
+    return parameter.detach().cpu()[kept].double()
 
 
 def _float32(value: float) -> float:

@@ -16,9 +16,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import prange
 
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 
 FRACTION_BITS = 12
 ACTIVATION_LIMIT = 1 << 23  # activations are in [-2^23, 2^23 - 1]
@@ -196,11 +195,11 @@ def _activation(a, bias, half, scale, rectify):
 
 
 @njit(parallel=True)
-def _layer(x, weight, bias, shift, rectify, added, out):
+def _layer(x, weight, bias, shift, rectify, added, out, share):
     """added [N, out] or [0, out]: nothing."""
     scale = 1.0 / (1 << shift)
     half = float(1 << (shift - 1)) if shift > 0 else 0.0
-    for block in prange((len(x) + TASK_ROWS - 1) // TASK_ROWS):
+    for block in portion((len(x) + TASK_ROWS - 1) // TASK_ROWS, share):
         sums = np.empty(out.shape[1])
         inputs = np.zeros(len(weight))
         for n in range(block * TASK_ROWS, min((block + 1) * TASK_ROWS, len(x))):
@@ -213,11 +212,11 @@ def _layer(x, weight, bias, shift, rectify, added, out):
 
 
 @njit(parallel=True)
-def _parameters(x, weight, bias, shift, rectify, mask, rows, means, index):
+def _parameters(x, weight, bias, shift, rectify, mask, rows, means, index, share):
     scale = 1.0 / (1 << shift)
     half = float(1 << (shift - 1)) if shift > 0 else 0.0
     slots, channels = mask.shape[1], means.shape[1]
-    for block in prange((len(x) + TASK_ROWS - 1) // TASK_ROWS):
+    for block in portion((len(x) + TASK_ROWS - 1) // TASK_ROWS, share):
         sums = np.empty(weight.shape[1])
         inputs = np.zeros(len(weight))
         for n in range(block * TASK_ROWS, min((block + 1) * TASK_ROWS, len(x))):

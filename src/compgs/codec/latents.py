@@ -4,20 +4,19 @@ A file has one section of these for each range, coarse to fine, so that its begi
 range depends on another range but, with contexts that see coordinates, on the positions of all anchors.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from compgs.codec.anchor_order import MAXIMUM_DEPTH
 from compgs.codec.content import (
+    CodedGroup,
     Dimensions,
-    Group,
     Role,
     conditional_tables,
     fixed_point,
     reconstruct,
-    walk,
 )
 from compgs.codec.fields import FieldReader, varint
 from compgs.codec.format import LATENTS, MAX_ANCHORS, MAX_COUPLED_PRIMITIVES, MAX_SYMBOL, SECTION_NAMES
@@ -61,15 +60,13 @@ def chosen_levels(counts: np.ndarray) -> list[int]:
 
 def encode_range(
     level: int,
-    groups: Sequence[Group],  # of the range's anchors
-    mask: np.ndarray,  # [n, K] bool
-    places: np.ndarray,  # [n, 3] `content.coordinate_context`
+    mask: np.ndarray,  # [n, K] bool, of the range's anchors
+    chain: Iterable[CodedGroup],  # of these: `content.walk`
 ) -> bytes:
     """The section of n anchors."""
     parts = [bytes([level]), varint(len(mask)), varint(int(mask.sum()))]
     parts += [
-        encode_symbols(coded.symbols.ravel(), coded.table_index.ravel(), coded.tables)
-        for coded in walk(groups, mask, places)
+        encode_symbols(coded.symbols.ravel(), coded.table_index.ravel(), coded.tables) for coded in chain
     ]
     return b"".join(parts)
 

@@ -11,12 +11,11 @@ depend on how many there are.
 """
 
 import numpy as np
-from numba import prange
 
 from compgs.codec.fields import FieldReader, varint
 from compgs.codec.tables import LOOKUP_BITS, PRECISION_BITS, FrequencyTables
 from compgs.errors import CorruptSection
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 
 CHUNK_SYMBOLS = 1 << 20
 SINGLE_STATE_SYMBOLS = (
@@ -201,8 +200,8 @@ def _encode_chunk(symbols, index, lowest, counts, offsets, cumulative, words):
 
 
 @njit(parallel=True)
-def _encode_chunks(symbols, index, lowest, counts, offsets, cumulative, words, first, escapes):
-    for c in prange(len(first)):
+def _encode_chunks(symbols, index, lowest, counts, offsets, cumulative, words, first, escapes, share):
+    for c in portion(len(first), share):
         start = c * CHUNK_SYMBOLS
         stop = min(start + CHUNK_SYMBOLS, len(symbols))
         first[c], escapes[c] = _encode_chunk(
@@ -263,8 +262,8 @@ def _decode_chunk(words, begin, end, index, lowest, counts, offsets, cumulative,
 
 
 @njit(parallel=True)
-def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, lookup, symbols, escapes):
-    for c in prange(len(escapes)):
+def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, lookup, symbols, escapes, share):
+    for c in portion(len(escapes), share):
         start = c * CHUNK_SYMBOLS
         stop = min(start + CHUNK_SYMBOLS, len(symbols))
         escapes[c] = _decode_chunk(

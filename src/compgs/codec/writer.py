@@ -1,12 +1,13 @@
 """Integers become bytes: the mirror image of reader.py, section by section."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from compgs.codec.anchor_order import canonical_order, level_counts
-from compgs.codec.content import FileContent, Group, Role, coordinate_context
+from compgs.codec.content import CodedGroup, FileContent, Group, Role, coordinate_context, walk
 from compgs.codec.fields import FieldReader
 from compgs.codec.format import (
     HEADS,
@@ -28,7 +29,7 @@ from compgs.codec.format import (
     container_bytes,
     pack,
 )
-from compgs.codec.integer_network import IntegerNetwork
+from compgs.codec.integer_network import IntegerNetwork, first_rows
 from compgs.codec.latents import chosen_levels, encode_range, read_head
 from compgs.codec.limits import least_bytes
 from compgs.codec.mask_coder import encode_masks
@@ -53,18 +54,26 @@ Geometry = Literal["octree", "tmc3"]
 
 
 def write_content(
-    content: FileContent, geometry: Geometry = "octree", levels: list[int] | None = None
+    content: FileContent,
+    geometry: Geometry = "octree",
+    levels: list[int] | None = None,
+    *,
+    coded: Sequence[CodedGroup] | None = None,
 ) -> bytes:
     """The bytes of a .cgs file. Anchors may come in any order; the file has them in the canonical one.
 
     `geometry`: positions by the octree coder, or as in the paper by G-PCC, whose program `tmc3` writer and reader then
     need. `levels`: last octree level of each range of latents, ascending, the last one the octree's depth; chosen by
-    the number of anchors if not given. Symbols of coupled primitives that do not exist are ignored.
+    the number of anchors if not given. Symbols of coupled primitives that do not exist are ignored. `coded`: what a
+    `content.walk` along the groups gives, if that is known and the anchors are in canonical order; networks are then
+    not evaluated again.
 
     Raises MissingDependency without that program, NotEncodable if the format cannot represent the content.
     """
     check_content(content)
-    content = _reordered(content, canonical_order(content.coordinates))
+    ordered = _reordered(content, canonical_order(content.coordinates))
+    assert coded is None or ordered is content, "coded groups in another order than the file's"
+    content = ordered
     counts = level_counts(content.coordinates)
     networks = [g.prior for g in content.groups if isinstance(g.prior, IntegerNetwork)]
     tables = [table for g in content.groups if not isinstance(g.prior, IntegerNetwork) for table in g.prior]
@@ -78,7 +87,7 @@ def write_content(
         Section(NETWORKS, encode_networks(networks)),
         Section(HEADS, encode_heads(content.heads)),
     ]
-    ranges = _ranges(content, counts, chosen_levels(counts) if levels is None else levels)
+    ranges = _ranges(content, counts, chosen_levels(counts) if levels is None else levels, coded)
     padding = _padding(content, sections, ranges)
     if padding:  # before the ranges, so that the beginnings of the file that are scenes are padded, too
         sections.append(Section(PADDING, bytes(padding)))
@@ -93,16 +102,32 @@ def _positions(coordinates: np.ndarray, geometry: Geometry) -> Section:
     return Section(POSITIONS_GPCC, encode_positions_tmc3(coordinates))
 
 
-def _ranges(content: FileContent, counts: np.ndarray, levels: list[int]) -> list[Section]:
+def _ranges(
+    content: FileContent, counts: np.ndarray, levels: list[int], coded: Sequence[CodedGroup] | None
+) -> list[Section]:
     ends = [int(counts[level]) for level in levels]
     assert levels[-1] == len(counts) - 1 and ends == sorted(set(ends)) and len(levels) <= MAX_RANGES, levels
     places = coordinate_context(content.coordinates)
     sections = []
     for level, start, end in zip(levels, [0, *ends], ends, strict=False):
         rows = slice(start, end)
-        groups = [replace(group, symbols=group.symbols[rows]) for group in content.groups]
-        sections.append(Section(LATENTS, encode_range(level, groups, content.mask[rows], places[rows])))
+        mask = content.mask[rows]
+        if coded is None:
+            groups = [replace(group, symbols=group.symbols[rows]) for group in content.groups]
+            chain = walk(groups, mask, places[rows])
+        else:
+            chain = _of_rows(content, coded, rows)
+        sections.append(Section(LATENTS, encode_range(level, mask, chain)))
     return sections
+
+
+def _of_rows(content: FileContent, coded: Sequence[CodedGroup], rows: slice) -> Iterator[CodedGroup]:
+    """The same groups of a range of the anchors."""
+    first = first_rows(content.mask)
+    existing = slice(int(first[rows.start]), int(first[rows.stop]))
+    for group, whole in zip(content.groups, coded, strict=True):
+        part = existing if group.shape.role == Role.RESIDUAL else rows
+        yield CodedGroup(whole.symbols[part], whole.table_index[part], whole.tables, whole.latents[part])
 
 
 def check_content(content: FileContent) -> None:

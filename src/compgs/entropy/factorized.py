@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import prange
 from torch import Tensor, nn
 
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 
 REACH = 24  # symbols -24 to 24 have a bin of their own
 # No bin falls below this, as no symbol of an integer table has frequency 0.
@@ -77,11 +76,11 @@ def _bin(z, reach):
 
 
 @njit(parallel=True)
-def _bits(z, p, bits):
+def _bits(z, p, bits, share):
     """z [N, C], p [C, bins] -> bits [N]."""
     N, C = z.shape
     reach = p.shape[1] // 2
-    for i in prange(N):
+    for i in portion(N, share):
         total = np.float32(0)
         for c in range(C):
             k, f, beyond = _bin(z[i, c], reach)
@@ -91,12 +90,12 @@ def _bits(z, p, bits):
 
 
 @njit(parallel=True)
-def _bits_gradient(z, p, g, d_z, d_p):
+def _bits_gradient(z, p, g, d_z, d_p, share):
     """g [N], the gradient of the bits -> d_z [N, C] and parts d_p [chunks, C, bins] (zero before)."""
     N, C = z.shape
     reach = p.shape[1] // 2
     chunks = len(d_p)
-    for chunk in prange(chunks):
+    for chunk in portion(chunks, share):
         for i in range(N * chunk // chunks, N * (chunk + 1) // chunks):
             for c in range(C):
                 k, f, beyond = _bin(z[i, c], reach)

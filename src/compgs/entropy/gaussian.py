@@ -22,10 +22,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import prange
 from torch import Tensor
 
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 
 SCALE_LEVELS = 128  # tables of the codec
 SCALES_PER_OCTAVE = 12
@@ -203,11 +202,11 @@ def _element_gradient(s, g, by_x, by_s, d_x, d_s):
 
 
 @njit(parallel=True, fastmath=FASTMATH)
-def _bits(x, s, channels, bits, by_x, by_s):
+def _bits(x, s, channels, bits, by_x, by_s, share):
     """x, s flat [N * C] -> bits [N] and derivatives by_x, by_s, flat as x, or empty if not wanted."""
     N = len(bits)
     rows = max(1, BLOCK // max(channels, 1))
-    for block in prange((N + rows - 1) // rows):
+    for block in portion((N + rows - 1) // rows, share):
         scratch = np.empty((3, rows * channels), np.float32)
         first, last = block * rows, min(N, (block + 1) * rows)
         p, q = first * channels, last * channels
@@ -223,11 +222,11 @@ def _bits(x, s, channels, bits, by_x, by_s):
 
 
 @njit(parallel=True, fastmath=FASTMATH)
-def _bits_gradient(s, channels, g, by_x, by_s, d_x, d_s):
+def _bits_gradient(s, channels, g, by_x, by_s, d_x, d_s, share):
     """g [N], the gradient of the bits -> gradients d_x, d_s, flat [N * C] as s."""
     N = len(g)
     rows = max(1, BLOCK // max(channels, 1))
-    for block in prange((N + rows - 1) // rows):
+    for block in portion((N + rows - 1) // rows, share):
         scratch = np.empty(rows * channels, np.float32)
         first, last = block * rows, min(N, (block + 1) * rows)
         for r in range(last - first):

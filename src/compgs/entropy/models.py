@@ -55,17 +55,18 @@ class Quantized:
 
 
 class EntropyModel(nn.Module):
-    """Hyperpriors for the embeddings, the reference as context for everything else (CompGS Sec. 3.3).
+    """Hyperprior for the reference embeddings, the references as context for everything else (CompGS Sec. 3.3).
 
     f ──analysis──► z_f ──► (mean, scale) of f
     f_hat ──► (mean, scale) of c
-    g ──analysis──► z_g ┐
-    f_hat ──────────────┴──► (mean, scale) of g
+
+    Residual embeddings, which here all anchors share, pass through: the file holds them beside the heads.
     """
 
     def __init__(self, model: ModelConfig, entropy: EntropyConfig) -> None:
         super().__init__()
-        residuals = model.coupled_primitives * model.residual_dim
+        self.slots = model.coupled_primitives
+        self.residual_channels = model.coupled_primitives * model.residual_dim
         shape = entropy.network_blocks, entropy.network_width
         self.reference_analysis = HyperAnalysis(model.reference_dim, entropy.reference_hyper_dim)
         self.reference_density = FactorizedDensity(entropy.reference_hyper_dim)
@@ -75,16 +76,6 @@ class EntropyModel(nn.Module):
             model.reference_dim, 6, *shape, mean_gain=1.0 / entropy.covariance_step
         )
         self.log_covariance_step = nn.Parameter(torch.full((6,), entropy.covariance_step).log())
-        self.residual_analysis: HyperAnalysis | None = None
-        self.residual_density: FactorizedDensity | None = None
-        self.residual_network: EntropyNetwork | None = None
-        if model.residuals:
-            hyper = model.coupled_primitives  # one channel for each (Ref.)
-            self.residual_analysis = HyperAnalysis(residuals, hyper)
-            self.residual_density = FactorizedDensity(hyper)
-            self.residual_network = EntropyNetwork(model.reference_dim + hyper, residuals, *shape)
-            with torch.no_grad():
-                self.residual_network.biases[-1][:residuals].uniform_(-SLOT_SPREAD, SLOT_SPREAD)
 
     @property
     def covariance_step(self) -> Tensor:
@@ -94,8 +85,16 @@ class EntropyModel(nn.Module):
     @property
     def coded_networks(self) -> tuple[EntropyNetwork, ...]:
         """The networks that the decoder needs, and so the file holds."""
-        own = () if self.residual_network is None else (self.residual_network,)
-        return self.reference_network, self.covariance_network, *own
+        return self.reference_network, self.covariance_network
+
+    @property
+    def channels(self) -> dict[str, int]:
+        """Symbols that each stream codes for an anchor, by the stream's name."""
+        return {
+            "reference_hyper": len(self.reference_density.logits),
+            "reference": self.reference_network.channels,
+            "covariance": self.covariance_network.channels,
+        }
 
     def statistics(self) -> list[nn.Parameter]:
         """Parameters that say what latents cost, and nothing about what they are."""
@@ -116,8 +115,10 @@ class EntropyModel(nn.Module):
         analysis = self.reference_analysis.first
         yield Reader(analysis.weight, analysis.bias, 1, 0, 1.0)
         yield from self.covariance_network.readers(0)
-        if self.residual_network is not None:
-            yield from self.residual_network.readers(0)
+
+    def starting_residuals(self) -> Tensor:
+        """[K * residual_dim] residual embeddings that training starts from, in quantization steps."""
+        return torch.empty(self.residual_channels).uniform_(-SLOT_SPREAD, SLOT_SPREAD)
 
     @torch.no_grad()
     def restart_reference_scales(self, references: Tensor) -> tuple[nn.Parameter, nn.Parameter]:
@@ -158,25 +159,84 @@ class EntropyModel(nn.Module):
             "reference": bits_f,
             "covariance": bits_c,
         }
-        if self.residual_network is None:
-            return Quantized(f_hat, c_hat, residuals.expand(len(f_hat), -1), bits if rate else {})
-        assert self.residual_analysis is not None and self.residual_density is not None
+        g_hat, bits_g = self.code_residuals(residuals, f_hat, code, rate=rate, noise=noise, mask=mask)
+        return Quantized(f_hat, c_hat, g_hat, {**bits, **bits_g} if rate else {})
+
+    def code_residuals(
+        self,
+        residuals: Tensor,
+        f_hat: Tensor,  # [N, reference_dim]
+        code: "Coder",
+        *,
+        rate: bool,
+        noise: Callable[[Tensor], Tensor] | None,
+        mask: Tensor | None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """g_hat [N, K * residual_dim], and bits [N] of the streams that this takes; arguments as of `forward`."""
+        return residuals.expand(len(f_hat), -1), {}
+
+
+class OwnResidualsEntropyModel(EntropyModel):
+    """The same where each anchor has its own residual embeddings, as in the paper.
+
+    g ──analysis──► z_g ┐
+    f_hat ──────────────┴──► (mean, scale) of g
+    """
+
+    def __init__(self, model: ModelConfig, entropy: EntropyConfig) -> None:
+        super().__init__(model, entropy)
+        hyper = self.slots  # one channel for each coupled primitive (Ref.)
+        self.residual_analysis = HyperAnalysis(self.residual_channels, hyper)
+        self.residual_density = FactorizedDensity(hyper)
+        self.residual_network = EntropyNetwork(
+            model.reference_dim + hyper,
+            self.residual_channels,
+            entropy.network_blocks,
+            entropy.network_width,
+        )
+        with torch.no_grad():
+            self.residual_network.biases[-1][: self.residual_channels].uniform_(-SLOT_SPREAD, SLOT_SPREAD)
+
+    @property
+    def coded_networks(self) -> tuple[EntropyNetwork, ...]:
+        return *super().coded_networks, self.residual_network
+
+    @property
+    def channels(self) -> dict[str, int]:
+        own = {"residual_hyper": self.slots, "residual": self.residual_channels}
+        return {**super().channels, **own}
+
+    def readers(self) -> Iterator[Reader]:
+        yield from super().readers()
+        yield from self.residual_network.readers(0)
+
+    def starting_residuals(self) -> Tensor:
+        """[K * residual_dim] residual embeddings that a new anchor starts with: what the prior expects."""
+        return self.residual_network.biases[-1].detach()[: self.residual_channels].clone()
+
+    def code_residuals(
+        self,
+        residuals: Tensor,
+        f_hat: Tensor,
+        code: "Coder",
+        *,
+        rate: bool,
+        noise: Callable[[Tensor], Tensor] | None,
+        mask: Tensor | None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         z_g = self.residual_analysis(residuals)
         context = torch.cat([f_hat, round_straight_through(z_g)], 1)
         g_hat, bits_g = code(residuals, context, self.residual_network, mask=mask)
         hyper = _hyper_bits(self.residual_density, z_g, noise) if rate else bits_g
-        bits |= {"residual_hyper": hyper, "residual": bits_g}
-        return Quantized(f_hat, c_hat, g_hat, bits if rate else {})
+        return g_hat, {"residual_hyper": hyper, "residual": bits_g}
 
 
-def starting_residuals(entropy: EntropyModel, model: ModelConfig) -> Tensor:
-    """[K * residual_dim] residual embeddings that a new anchor starts with, in quantization steps: what the prior
-    expects; where all anchors share them, what training starts from.
-    """
-    network = entropy.residual_network
-    if network is not None:
-        return network.biases[-1].detach()[: network.channels].clone()
-    return torch.empty(model.coupled_primitives * model.residual_dim).uniform_(-SLOT_SPREAD, SLOT_SPREAD)
+Coder = Callable[..., tuple[Tensor, Tensor]]  # `code_latents` with what a whole step has in common
+
+
+def make_entropy_model(model: ModelConfig, entropy: EntropyConfig) -> EntropyModel:
+    """The one for a model's kind of residual embeddings: chosen here, once."""
+    return (OwnResidualsEntropyModel if model.residuals else EntropyModel)(model, entropy)
 
 
 def _hyper_bits(density: FactorizedDensity, z: Tensor, noise: Callable[[Tensor], Tensor] | None) -> Tensor:

@@ -12,10 +12,9 @@ BLAS (`tensors/residual_mlp_kernels.py`); these need nothing but numba.
 """
 
 import numpy as np
-from numba import prange
 
 from compgs.model.constants import NEGATIVE_SLOPE
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 from compgs.numerics.products import multiply
 
 ANCHORS = 128  # in a block
@@ -48,7 +47,10 @@ def tiled(biases):
     tiles = np.empty((len(biases), ROWS * H), np.float32)
     for b in range(len(biases)):
         for i in range(ROWS):
-            tiles[b, i * H : (i + 1) * H] = biases[b]
+            for c in range(
+                H
+            ):  # not a slice: what numba would say of other shapes takes two seconds to compile
+                tiles[b, i * H + c] = biases[b, c]
     return tiles
 
 
@@ -95,9 +97,10 @@ def begin(
     anchor_entry,  # [F, H + O]
     entry_bias,  # [H + O]
     shared,  # [A, H + O], written
+    share,
 ):
     """The anchors' part of the first layer and of the skip, biases included."""
-    for block in prange((len(features) + ANCHORS - 1) // ANCHORS):
+    for block in portion((len(features) + ANCHORS - 1) // ANCHORS, share):
         first, last = block * ANCHORS, min(len(features), (block + 1) * ANCHORS)
         begin_block(features[first:last], anchor_entry, entry_bias, shared[first:last])
 
@@ -124,13 +127,14 @@ def forward(
     biases2,
     output_weight,
     out,  # [M, O], written
+    share,
 ):
     M, G, blocks = len(index), len(residual_entry), len(weights1)
     H, O = output_weight.shape
     groups = (M + ROWS - 1) // ROWS
     tasks = min(groups, TASKS)
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
-    for t in prange(tasks):
+    for t in portion(tasks, share):
         own = np.empty((ROWS, G), np.float32)
         first = np.empty((ROWS, H + O), np.float32)
         x = np.empty((blocks + 1, ROWS, H), np.float32)

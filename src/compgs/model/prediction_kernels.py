@@ -13,11 +13,10 @@ primitives were drawn, then side by side. Blocks are fixed: no result depends on
 import math
 
 import numpy as np
-from numba import prange
 
 from compgs.model.constants import OPACITY_CUTOFF, SMALLEST_DISTANCE
 from compgs.model.network_kernels import ANCHORS, ROWS, TASKS, begin_block, hidden_layers, tiled
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 from compgs.numerics.products import multiply
 
 _FASTMATH = {"contract", "nsz", "arcp"}
@@ -69,8 +68,9 @@ def _sigmoids(flat, n):
 def activate_opacities(
     raw,  # [P, C] of the opacity or the appearance network: opacity comes first
     opacities,  # [P]
+    share,
 ):
-    for block in prange((len(raw) + ROWS - 1) // ROWS):
+    for block in portion((len(raw) + ROWS - 1) // ROWS, share):
         first, last = block * ROWS, min(len(raw), (block + 1) * ROWS)
         for i in range(first, last):
             opacities[i] = _TWO * raw[i, 0]
@@ -84,9 +84,10 @@ def activate_colors(
     raw,  # [P, C] of the color or the appearance network: color comes last
     rows,  # [M] int64: those to activate
     colors,  # [M, 3] display RGB
+    share,
 ):
     m, first_channel = len(rows), raw.shape[1] - 3
-    for block in prange((m + ROWS - 1) // ROWS):
+    for block in portion((m + ROWS - 1) // ROWS, share):
         first, last = block * ROWS, min(m, (block + 1) * ROWS)
         for j in range(first, last):
             for c in range(3):
@@ -103,9 +104,10 @@ def affine_transform(
     means,  # [M, 3] world units
     scales,  # [M, 3] world units
     quaternions,  # [M, 4] w-x-y-z, not normalized
+    share,
 ):
     m = len(raw)
-    for block in prange((m + ROWS - 1) // ROWS):
+    for block in portion((m + ROWS - 1) // ROWS, share):
         first, last = block * ROWS, min(m, (block + 1) * ROWS)
         bounded = np.zeros((ROWS, 3), np.float32)
         for j in range(first, last):
@@ -139,8 +141,9 @@ def activation_gradients(
     d_appearance,  # [M, 4] by raw opacity and color
     d_geometry,  # [M, 10]
     d_log_scales,  # [A, 6] added to
+    share,
 ):
-    for chunk in prange(len(bounds) - 1):
+    for chunk in portion(len(bounds) - 1, share):
         for j in range(bounds[chunk], bounds[chunk + 1]):
             a = anchor[j]
             d_appearance[j, 0] = d_opacities[j] * (_ONE - opacities[j] * opacities[j])
@@ -167,8 +170,9 @@ def see(
     center,  # [3] of the camera, world units
     distance_unit,  # world units
     seen,  # [V, D + 4]: reference embedding, view embedding
+    share,
 ):
-    for block in prange((len(anchors) + ANCHORS - 1) // ANCHORS):
+    for block in portion((len(anchors) + ANCHORS - 1) // ANCHORS, share):
         first, last = block * ANCHORS, min(len(anchors), (block + 1) * ANCHORS)
         _see_block(anchors[first:last], positions, references, center, distance_unit, seen[first:last])
 
@@ -196,8 +200,9 @@ def gather_geometry(
     drawn_means,  # [M, 3], and so on, written
     drawn_scales,
     drawn_quaternions,
+    share,
 ):
-    for block in prange((len(index) + ROWS - 1) // ROWS):
+    for block in portion((len(index) + ROWS - 1) // ROWS, share):
         for j in range(block * ROWS, min(len(index), (block + 1) * ROWS)):
             p = index[j]
             for c in range(3):
@@ -231,12 +236,13 @@ def paired_appearance(
     output_weight,
     appearance,  # [places[V], 4], written: opacity (0: not drawn) and color
     drawn,  # [blocks] int64, written: primitives of each block that are drawn
+    share,
 ):
     V, D, G, H = len(anchors), references.shape[1], residuals.shape[1], len(output_weight)
     blocks, layers = len(drawn), len(weights1)
     tasks = min(blocks, TASKS)
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
-    for t in prange(tasks):
+    for t in portion(tasks, share):
         seen = np.empty((ANCHORS, D + 4), np.float32)
         shared = np.empty((ANCHORS, H + 4), np.float32)
         own = np.empty((ROWS, G), np.float32)
@@ -302,11 +308,12 @@ def gather_drawn(
     anchors, first_coupled, places, appearance, offsets,
     means, scales, quaternions,
     index, drawn_means, drawn_scales, drawn_quaternions, opacities, colors,
+    share,
 ):  # fmt: skip
     """Fills the arrays of the drawn primitives and which they are; `offsets` [blocks + 1] int64: where each block's
     begin.
     """
-    for block in prange(len(offsets) - 1):
+    for block in portion(len(offsets) - 1, share):
         to = offsets[block]
         for v in range(block * ANCHORS, min(len(anchors), (block + 1) * ANCHORS)):
             shift = first_coupled[anchors[v]] - places[v]

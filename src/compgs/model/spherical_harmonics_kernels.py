@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-from numba import prange
 
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 
 _PI = math.pi
 # Norms of the basis functions: Y<degree>, and the monomials that they belong to.
@@ -79,9 +78,10 @@ def view_colors(
     visible,  # [M] bool: the others become black
     degree,  # up to which coefficients are used
     colors,  # [M, 3] display RGB, written
+    share,
 ):
     n, used = len(means), (degree + 1) * (degree + 1) - 1
-    for block in prange((n + _BLOCK - 1) // _BLOCK):
+    for block in portion((n + _BLOCK - 1) // _BLOCK, share):
         b = np.empty(15, np.float32)
         for i in range(block * _BLOCK, min(block * _BLOCK + _BLOCK, n)):
             if not visible[i]:
@@ -109,9 +109,10 @@ def view_colors_gradient(
     d_means,  # [M, 3], and so on, written
     d_dc,
     d_rest,
+    share,
 ):
     n, held, used = len(means), rest.shape[1], (degree + 1) * (degree + 1) - 1
-    for block in prange((n + _BLOCK - 1) // _BLOCK):
+    for block in portion((n + _BLOCK - 1) // _BLOCK, share):
         b, g = np.empty(15, np.float32), np.empty(15, np.float32)
         for i in range(block * _BLOCK, min(block * _BLOCK + _BLOCK, n)):
             # Nothing reaches a channel that was clamped; splats out of view are black in all three.

@@ -1,33 +1,64 @@
-"""`njit`, as every kernel of the package uses it: compiled once on a machine, never stale, safe among threads.
+"""`njit`, as every kernel of the package uses it: compiled once on a machine, never stale, in any number of threads.
 
-The options are numba's. There is no `cache`: kernels are always kept (`kernel_cache`).
+The options are numba's. There is no `cache`: kernels are always kept (`kernel_cache`). With `parallel=True` a kernel
+is called by several threads at once (`crew`), each with its share of the work as the last argument, which callers from
+Python leave out:
 
-Kernels with `parallel=True` run one at a time. Without OpenMP or TBB, numba's own threads serve one caller only, and
-end the process when a second thread calls: Python threads that render take turns instead. Processes that are *forked*
-after a parallel kernel has run cannot run another, in any of numba's threading layers; use the start method `spawn`.
+    @njit(parallel=True)
+    def double(x, y, share):
+        for i in portion(len(x), share):
+            y[i] = 2 * x[i]
+
+    double(x, y)
+
+Shares are contiguous. What stands before the loop is done by every thread. Arrays of one call must not overlap.
+
+Any number of Python threads may call kernels at the same time. Processes are to be started with `spawn`: kernels run
+in forked ones, too, but torch's threads do not survive a fork.
 """
 
-import threading
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any
 
 import numba
-from numba.core import event
+from numba.core import compiler, event, types
 from numba.core.registry import CPUDispatcher
 
 from compgs.numerics.compiling import COMPILING
+from compgs.numerics.crew import ALL, CREW, Share
 from compgs.numerics.kernel_cache import cache_of
 
-_ONE_AT_A_TIME = threading.RLock()  # as a handler of a signal may run kernels within a kernel's call
+
+class Kernel(CPUDispatcher):
+    """A compiled function."""
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """What another kernel calls: one version for all values of a type. (numba would compile one for each constant
+        that stands in a call.)"""
+        kws = {name: types.unliteral(kind) for name, kind in kws.items()}
+        return super().get_call_template(tuple(map(types.unliteral, args)), kws)
 
 
-class ParallelKernel(CPUDispatcher):
-    """A compiled function with threads of its own."""
+class ParallelKernel(Kernel):
+    """A compiled function whose calls are shared among threads."""
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        with _ONE_AT_A_TIME:
-            return super().__call__(*args, **kwargs)
+    def __call__(self, *args: Any) -> None:
+        call = super().__call__
+        count = numba.get_num_threads()
+        if count == 1:
+            call(*args, ALL)
+        else:
+            CREW.do(lambda share: call(*args, share), count)
+
+
+class _WithoutOverlaps(compiler.Compiler):
+    """Compiles a function whose arrays do not overlap, which spares loops their checks, as numba does for bodies of
+    parallel loops."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.state.flags.noalias = True
 
 
 def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
@@ -36,12 +67,29 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         return lambda given: njit(given, **options)
     if not isinstance(function, FunctionType) or "cache" in options:
         raise TypeError("expected a function, and numba's options but for cache")
+    parallel = options.pop("parallel", False)
     if getattr(numba.config, "DISABLE_JIT", False):
-        return function
-    kind = ParallelKernel if options.get("parallel") else CPUDispatcher
-    kernel: Any = kind(py_func=function, targetoptions={"nopython": True, "boundscheck": None, **options})
+        return (lambda *args: function(*args, ALL)) if parallel else function
+    kernel: Any
+    if parallel:
+        options = {"nogil": True, "error_model": "numpy", **options}
+        kernel = ParallelKernel(function, targetoptions=_options(options), pipeline_class=_WithoutOverlaps)
+    else:
+        kernel = Kernel(function, targetoptions=_options(options))
     kernel._cache = cache_of(function)
     return kernel
+
+
+def _options(options: dict[str, Any]) -> dict[str, Any]:
+    """As numba's own njit completes them; an entry for C, which nobody uses, is not compiled."""
+    return {"nopython": True, "boundscheck": None, "no_cfunc_wrapper": True, **options}
+
+
+@njit
+def portion(count: int, share: Share) -> range:
+    """The part of range(count) that is in a share; for kernels."""
+    part, parts = share
+    return range(count * part // parts, count * (part + 1) // parts)
 
 
 class _Clock(event.Listener):

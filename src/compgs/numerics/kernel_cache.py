@@ -15,7 +15,8 @@ kernels are compiled anew in each process. The folders of the FOLDERS_KEPT lates
 are removed when a new one is made.
 
 Several processes may share a folder: a file is written under another name and renamed, holds one kernel, and
-replaces at worst the same kernel. What is damaged, or vanishes, is compiled again.
+replaces at worst the same kernel. Who begins to compile a kernel locks it (where the system has such locks); others
+wait and take it from the cache. What is damaged, or vanishes, is compiled again.
 """
 
 import functools
@@ -31,7 +32,7 @@ import tempfile
 import time
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, BinaryIO
 from uuid import uuid4
 
 import llvmlite
@@ -40,6 +41,11 @@ import numpy
 from numba.core import caching
 
 import compgs
+
+try:
+    import fcntl
+except ImportError:  # Windows: two processes may compile the same
+    fcntl = None  # type: ignore[assignment]
 
 PACKAGE = Path(compgs.__file__).resolve().parent
 FOLDER = "compgs-kernels"
@@ -70,12 +76,29 @@ class KernelCache(caching.FunctionCache):
         super().__init__(function)
         self._cache_file = _KernelFiles(folder, self._impl.filename_base)
 
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """A kernel from the cache; one that another process is compiling, when it has done so. None: the caller is to
+        compile it, and others wait."""
+        key = self._index_key(sig, target_context.codegen())
+        kernel = super().load_overload(sig, target_context)
+        if kernel is None and self._cache_file.begin(key):
+            kernel = super().load_overload(sig, target_context)
+            if kernel is not None:
+                self._cache_file.end(key)
+        return kernel
+
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a compiled kernel, if that is possible: a full disk is no reason to stop."""
         try:
             super().save_overload(sig, data)
         except OSError:
             self.disable()
+        finally:
+            self._cache_file.end(self._index_key(sig, data.codegen))
+
+    def is_being_compiled(self, sig: Any, target_context: Any) -> bool:
+        """Whether a kernel is compiled by another process right now."""
+        return self._cache_file.is_locked(self._index_key(sig, target_context.codegen()))
 
 
 class _Kernels(caching.CompileResultCacheImpl):
@@ -111,6 +134,7 @@ class _KernelFiles:
     def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder
         self.name = name
+        self._held: dict[Path, BinaryIO] = {}  # locks on what this process is compiling
 
     def path(self, key: Any) -> Path:
         return self.folder / f"{self.name}.{_digest(repr(key).encode())[:16]}.kernel"
@@ -135,6 +159,45 @@ class _KernelFiles:
         finally:
             temporary.unlink(missing_ok=True)
 
+    def begin(self, key: Any) -> bool:
+        """Hold the lock of a kernel. True if another process held it meanwhile: the kernel may be there now."""
+        place = self.path(key)
+        if fcntl is None or place in self._held:
+            return False  # an earlier attempt to compile it failed
+        try:
+            if not self.folder.is_dir():
+                make_folder(self.folder)
+            lock = place.with_suffix(".lock").open("wb")
+            self._held[place] = lock
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                return True
+            # It may have been saved since it was looked for.
+            return place.is_file()
+        except OSError:
+            return False
+
+    def end(self, key: Any) -> None:
+        """Let go of the lock. Its file stays: another process may be waiting for it."""
+        lock = self._held.pop(self.path(key), None)
+        if lock is not None:
+            lock.close()
+
+    def is_locked(self, key: Any) -> bool:
+        """Whether another process holds the lock of a kernel."""
+        if fcntl is None:
+            return False
+        try:
+            with self.path(key).with_suffix(".lock").open("rb") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        return False
+
     def flush(self) -> None:
         for path in self.folder.glob(f"{self.name}.*.kernel"):
             path.unlink(missing_ok=True)
@@ -142,14 +205,30 @@ class _KernelFiles:
 
 def cache_of(function: FunctionType) -> caching._Cache:
     """Where the compiled versions of a kernel are kept; a cache that keeps nothing where nothing can be kept."""
-    parent = writable_parent()
     source = function.__globals__.get("__file__")
-    stamp = fingerprint(Path(source).resolve()) if source and parent else None
-    if parent is None or stamp is None:
+    folder = _folder(function.__module__, Path(source)) if source else None
+    if folder is None:
         return caching.NullCache()
-    folder = parent / f"{function.__module__}-{stamp}"
     mark_used(folder)
     return KernelCache(function, folder)
+
+
+def folder_of(module: str) -> Path | None:
+    """Where the kernels of a module of the package are kept, without importing it; None if they cannot be kept."""
+    source = _file_of(module)
+    return None if source is None else _folder(module, source)
+
+
+def _folder(module: str, source: Path) -> Path | None:
+    parent = writable_parent()
+    stamp = fingerprint(source.resolve()) if parent else None
+    return parent / f"{module}-{stamp}" if parent and stamp else None
+
+
+def is_being_compiled(kernel: Any, arguments: tuple[Any, ...]) -> bool:
+    """Whether another process compiles a kernel for these types right now."""
+    cache = kernel._cache
+    return isinstance(cache, KernelCache) and cache.is_being_compiled(arguments, kernel.targetctx)
 
 
 # ---- which sources

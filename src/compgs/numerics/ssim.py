@@ -13,9 +13,8 @@ them, and not averaged over.
 import math
 
 import numpy as np
-from numba import prange
 
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 from compgs.numerics.vector_sums import add_in_any_order
 
 WINDOW_SIZE = 11
@@ -134,13 +133,13 @@ def _absolute_difference(x, y, scale):
 
 
 @njit(parallel=True)
-def _compare(x, y, scale, maps, sums, counts):
+def _compare(x, y, scale, maps, sums, counts, share):
     """x, y [H, 3 W] -> sums [H, 2] of |x - y| and SSIM by row, maps [H, 3, 3 W] of the gradient of SSIM.
 
     counts [H, 3 W] float32: factors on SSIM at each element; None: one.
     """
     H, W = x.shape
-    for r in prange(H):
+    for r in portion(H, share):
         S = np.empty(_SCRATCH, np.float32)
         similarity = 0.0
         for first in range(0, W, _TILE):
@@ -163,10 +162,10 @@ def _compare(x, y, scale, maps, sums, counts):
 
 
 @njit(parallel=True)
-def _compare_gradient(x, y, scale, maps, ssim_factor, l1_factor, d_x):
+def _compare_gradient(x, y, scale, maps, ssim_factor, l1_factor, d_x, share):
     """d_x [H, 3 W] = ssim_factor * dSSIM/dx + l1_factor * sign(x - y)."""
     H, W = x.shape
-    for r in prange(H):
+    for r in portion(H, share):
         S = np.empty(_SCRATCH, np.float32)
         for first in range(0, W, _TILE):
             last = min(W, first + _TILE)

@@ -15,9 +15,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import prange
 
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 from compgs.render.settings import RasterSettings
 
 TILE_WIDTH = 8  # pixels
@@ -190,9 +189,10 @@ def find_visible(
     packed,
     found,
     room,
+    share,
 ):
     """Fills `visible` [M] and, of the visible, `boxes` [M, 4] and log2 opacity; counts for each chunk."""
-    for chunk in prange(CHUNKS):
+    for chunk in portion(CHUNKS, share):
         begin, end = chunk_bounds(chunk, means.shape[0])
         n, tiles = np.int64(0), np.int64(0)
         for i in range(begin, end):
@@ -221,9 +221,10 @@ def find_visible(
 def find_tiles(
     means, covariances, determinants, colors, log2_cutoff, tiles_x, visible, boxes, room,
     packed, slots, rows, first_slot, slots_used, counts,
+    share,
 ):  # fmt: skip
     """Packs the visible splats, lists the tiles (`slots`) and rows that each one touches, and counts by tile."""
-    for chunk in prange(CHUNKS):
+    for chunk in portion(CHUNKS, share):
         counts[chunk, :] = 0
         begin, end = chunk_bounds(chunk, means.shape[0])
         slot = np.int64(0)
@@ -294,10 +295,10 @@ def start_tiles(counts, starts):
 
 
 @njit(parallel=True)
-def fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, entries, keys):
+def fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, entries, keys, share):
     """Writes the tiles' entries and depth keys; the slots then say where a splat's entries are."""
     bits = depths.view(np.uint32)  # depths are positive: their bits sort as they do
-    for chunk in prange(CHUNKS):
+    for chunk in portion(CHUNKS, share):
         begin, end = chunk_bounds(chunk, visible.shape[0])
         for i in range(begin, end):
             if not visible[i]:
@@ -313,10 +314,10 @@ def fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, ent
 
 
 @njit(parallel=True)
-def sort_tiles(starts, keys, order):
+def sort_tiles(starts, keys, order, share):
     """`order` [E]: each tile's entries by `keys` [E], equal ones as they come. It may take the place of the keys."""
     tiles = starts.shape[0] - 1
-    for turn in prange(turns(tiles)):
+    for turn in portion(turns(tiles), share):
         tile = tile_at(turn, tiles)
         if tile < tiles:
             begin, end = starts[tile], starts[tile + 1]

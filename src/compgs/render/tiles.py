@@ -18,9 +18,8 @@ variables (rather than in the buffer) spare the compiled code a check for overla
 """
 
 import numpy as np
-from numba import prange
 
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 from compgs.numerics.vector_sums import add_in_any_order
 from compgs.render.binning import (
     CHUNKS,
@@ -63,18 +62,45 @@ def exp2_minus(q):
     return p * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
 
 
+@njit(inline="always")
+def corner(tile, width):
+    """Left column and top row of a tile of an image."""
+    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    return tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
+
+
+@njit(inline="always")
+def falloff(dx, dy, l00, l10, l11, log2_opacity):
+    """Alpha of a splat at a distance in pixels, before cutoff and cap."""
+    p, r = l00 * dx + l10 * dy, l11 * dy
+    return exp2_minus(p * p + (r * r - log2_opacity))
+
+
+@njit(inline="always")
+def pass_through(t, uncapped, cutoff, cap, stop):
+    """At a pixel of transmittance t: alpha, the weight of the splat's color, the transmittance behind the splat, and
+    whether the pixel is not finished. (Of numbers alone: with an array as argument loops would not be vectorized.)
+    """
+    alpha = min(cap, uncapped)
+    alpha = alpha if alpha >= cutoff else ZERO
+    weight = alpha * t
+    t_next = t - weight
+    open_ = t_next > stop
+    return alpha, weight if open_ else ZERO, t_next if open_ else -abs(t), open_
+
+
 @njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
-def blend_forward(packed, starts, entries, order, background, cutoff, cap, stop, image, transmittance, ends):
+def blend_forward(
+    packed, starts, entries, order, background, cutoff, cap, stop, image, transmittance, ends, share
+):
     """Fills image [H, W, 3], transmittance [H, W] and, per tile, the entry after the last one needed."""
     height, width = transmittance.shape
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     tiles = starts.shape[0] - 1
-    for turn in prange(turns(tiles)):
+    for turn in portion(turns(tiles), share):
         tile = tile_at(turn, tiles)
         if tile >= tiles:
             continue
-        tile_y, tile_x = tile // tiles_x, tile % tiles_x
-        left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
+        left, top = corner(tile, width)
         x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
         s = np.zeros(SCRATCH, np.float32)
         splats = np.empty((ENTRIES_PER_CHECK, PARAMETERS), np.float32)
@@ -91,17 +117,9 @@ def blend_forward(packed, starts, entries, order, background, cutoff, cap, stop,
                 red, green, blue = splats[j, 6], splats[j, 7], splats[j, 8]
                 first_row, last_row = spans[j] >> 8, spans[j] & 255
                 for pixel in range(U(first_row) * WIDTH, U(last_row + 1) * WIDTH):
-                    dx = x - s[pixel + COLUMN]
-                    dy = y - s[pixel + ROW]
-                    p, r = l00 * dx + l10 * dy, l11 * dy
-                    alpha = min(cap, exp2_minus(p * p + (r * r - log2_opacity)))
-                    alpha = alpha if alpha >= cutoff else ZERO
-                    t = s[pixel]
-                    weight = alpha * t
-                    t_next = t - weight
-                    open_ = t_next > stop
-                    weight = weight if open_ else ZERO
-                    s[pixel] = t_next if open_ else -abs(t)
+                    dx, dy = x - s[pixel + COLUMN], y - s[pixel + ROW]
+                    uncapped = falloff(dx, dy, l00, l10, l11, log2_opacity)
+                    _, weight, s[pixel], _ = pass_through(s[pixel], uncapped, cutoff, cap, stop)
                     s[pixel + RED] += weight * red
                     s[pixel + GREEN] += weight * green
                     s[pixel + BLUE] += weight * blue
@@ -150,20 +168,19 @@ def start_tile(s, left, top, width, height):
 def blend_backward(
     packed, starts, entries, order, ends, cutoff, cap, stop,
     image, transmittance, grad_image, grad_transmittance, moments,
+    share,
 ):  # fmt: skip
     """Fills moments [E, MOMENTS]: for each entry the sums over its pixels that gradients are made of.
 
     With v = alpha dL/dalpha: v, v dx, v dy, v dx^2, v dx dy, v dy^2, then weight dL/dimage (3).
     """
     height, width = transmittance.shape
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     tiles = starts.shape[0] - 1
-    for turn in prange(turns(tiles)):
+    for turn in portion(turns(tiles), share):
         tile = tile_at(turn, tiles)
         if tile >= tiles:
             continue
-        tile_y, tile_x = tile // tiles_x, tile % tiles_x
-        left, top = tile_x * TILE_WIDTH, tile_y * TILE_HEIGHT
+        left, top = corner(tile, width)
         x_origin, y_origin = f32(left) + HALF, f32(top) + HALF
         s = np.zeros(SCRATCH, np.float32)
         splats = np.empty((ENTRIES_PER_CHECK, PARAMETERS), np.float32)
@@ -192,18 +209,9 @@ def blend_backward(
                 first_row, last_row = spans[j] >> 8, spans[j] & 255
                 m0 = mx = my = mxx = mxy = myy = m_red = m_green = m_blue = ZERO
                 for pixel in range(U(first_row) * WIDTH, U(last_row + 1) * WIDTH):
-                    dx = x - s[pixel + COLUMN]
-                    dy = y - s[pixel + ROW]
-                    p, r = l00 * dx + l10 * dy, l11 * dy
-                    uncapped = exp2_minus(p * p + (r * r - log2_opacity))
-                    alpha = min(cap, uncapped)
-                    alpha = alpha if alpha >= cutoff else ZERO
-                    t = s[pixel]
-                    weight = alpha * t
-                    t_next = t - weight
-                    open_ = t_next > stop
-                    weight = weight if open_ else ZERO
-                    s[pixel] = t_next if open_ else -abs(t)
+                    dx, dy = x - s[pixel + COLUMN], y - s[pixel + ROW]
+                    uncapped = falloff(dx, dy, l00, l10, l11, log2_opacity)
+                    alpha, weight, s[pixel], open_ = pass_through(s[pixel], uncapped, cutoff, cap, stop)
                     g0, g1, g2 = s[pixel + RED], s[pixel + GREEN], s[pixel + BLUE]
                     color_grad = g0 * red + g1 * green + g2 * blue
                     behind = s[pixel + BEHIND] - weight * color_grad
@@ -241,13 +249,14 @@ def blend_backward(
 def sum_moments(
     visible, packed, first_slot, slots_used, slots, moments, opacities,
     grad_means, grad_covariances, grad_opacities, grad_colors,
+    share,
 ):  # fmt: skip
     """Adds up each splat's tiles, and turns moments into gradients.
 
     With X = cov^-1 and alpha = opacity exp(-d^T X d / 2): dL/dmean = -X sum(v d), dL/dcov = X sum(v d d^T) X
     / 2.
     """
-    for chunk in prange(CHUNKS):
+    for chunk in portion(CHUNKS, share):
         begin, end = chunk_bounds(chunk, visible.shape[0])
         for i in range(begin, end):
             if not visible[i]:

@@ -14,10 +14,9 @@ ellipsoid.
 import math
 
 import numpy as np
-from numba import prange
 
 from compgs.cameras import Camera
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 from compgs.render.settings import RasterSettings, jacobian_limits
 
 BLOCK = 4096  # anchors
@@ -62,9 +61,9 @@ def frustum(camera: Camera, settings: RasterSettings) -> np.ndarray:
 
 
 @njit(parallel=True, fastmath={"contract", "nsz"}, error_model="numpy")
-def meet_frustum(positions, radii, planes, mask):
+def meet_frustum(positions, radii, planes, mask, share):
     n = positions.shape[0]
-    for block in prange((n + BLOCK - 1) // BLOCK):
+    for block in portion((n + BLOCK - 1) // BLOCK, share):
         for i in range(block * BLOCK, min(block * BLOCK + BLOCK, n)):
             x, y, z, radius = positions[i, 0], positions[i, 1], positions[i, 2], radii[i]
             kept = True

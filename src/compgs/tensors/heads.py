@@ -8,6 +8,7 @@ and time. `make_heads` chooses, once; names of parameters are those of docs/bits
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,10 @@ class PredictionHeads(nn.Module):
     def weights(self) -> HeadWeights:
         """The same networks for rendering, as they are now; on the CPU they share the memory of the parameters."""
         tensors = {name: p.detach().cpu().numpy() for name, p in self.named_parameters()}
-        return HeadWeights(self.layout, self.dimensions, tensors)
+        # Training may have taken reference channels away since the networks were made.
+        blind = next(head for name, head in self.networks() if not NETWORKS[self.layout][name].sees)
+        dimensions = replace(self.dimensions, reference=blind.anchor_dim)
+        return HeadWeights(self.layout, dimensions, tensors)
 
     @abstractmethod
     def raw_geometry(self, f: Tensor, residuals: Tensor, index: Tensor) -> Tensor:

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import prange
 from torch import Tensor
 
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 
 PARTS = 16
 # Multiplications of a group: OpenBLAS gives a product that small to one thread.
@@ -67,10 +66,10 @@ def transposed_product(x: Tensor, y: Tensor) -> Tensor:
 
 
 @njit(parallel=True)
-def _sum_products(x, y, parts):
+def _sum_products(x, y, parts, share):
     n, size = len(x), x.shape[1] * y.shape[1]
     rows = max(1, GROUP_WORK // max(1, size))
-    for c in prange(len(parts)):
+    for c in portion(len(parts), share):
         product = np.empty((x.shape[1], y.shape[1]), np.float32)
         flat, total = product.ravel(), parts[c].ravel()
         last = n * (c + 1) // len(parts)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
-from compgs.model.constants import OPACITY_CUTOFF, SMALLEST_DISTANCE
+from compgs.model.constants import CUTOFF_SIGMAS, OPACITY_CUTOFF, SMALLEST_DISTANCE
 from compgs.tensors.primitives import Primitives
 
 if TYPE_CHECKING:
@@ -97,6 +97,14 @@ def affine_transform(
     scales = torch.sigmoid(raw[:, 3:6]) * sizes
     # An identity offset keeps the norm away from zero, where the direction has no gradient.
     return means, scales, torch.cat([raw[:, 6:7] + 1.0, raw[:, 7:10]], 1)
+
+
+def drawn_reach(
+    offsets: Tensor,  # [..., 3] of coupled primitives from their anchors, world units
+    scales: Tensor,  # [..., 3] standard deviations, world units
+) -> Tensor:  # [...]
+    """World units: how far from its anchor a coupled primitive is drawn. `HybridModel` culls by it, too."""
+    return offsets.norm(dim=-1) + CUTOFF_SIGMAS * scales.amax(-1)
 
 
 # put together ---------------------------------------------------------------------------------

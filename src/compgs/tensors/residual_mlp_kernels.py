@@ -12,7 +12,6 @@ depends on neither the number of threads nor their timing.
 """
 
 import numpy as np
-from numba import prange
 
 from compgs.model.network_kernels import (
     FASTMATH,
@@ -25,7 +24,7 @@ from compgs.model.network_kernels import (
     chosen_rows,
     tiled,
 )
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 
 CHUNKS = 16  # partial sums of a weight gradient
 
@@ -70,13 +69,14 @@ def forward(
     biases2,
     output_weight,
     out,  # [M, O], written
+    share,
 ):
     M, G, blocks = len(index), len(residual_entry), len(weights1)
     H, O = output_weight.shape
     groups = (M + ROWS - 1) // ROWS
     tasks = min(groups, TASKS)
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
-    for t in prange(tasks):
+    for t in portion(tasks, share):
         own = np.empty((ROWS, G), np.float32)
         first = np.empty((ROWS, H + O), np.float32)
         x = np.empty((blocks + 1, ROWS, H), np.float32)
@@ -143,6 +143,7 @@ def backward(
     # [chunks, size] zero, written: residual entry, per block weight 1, bias 1, weight 2, bias 2, then output weight;
     # [chunks, 0] if not wanted
     d_weights,
+    share,
 ):
     G, blocks = len(residual_entry), len(weights1)
     H, O = output_weight.shape
@@ -152,9 +153,11 @@ def backward(
     entry_t, output_t = np.ascontiguousarray(residual_entry.T), np.ascontiguousarray(output_weight.T)
     weights1_t, weights2_t = np.empty_like(weights1), np.empty_like(weights2)
     for b in range(blocks):
-        weights1_t[b], weights2_t[b] = weights1[b].T, weights2[b].T
+        for i in range(H):
+            for j in range(H):
+                weights1_t[b, j, i], weights2_t[b, j, i] = weights1[b, i, j], weights2[b, i, j]
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
-    for c in prange(len(bounds) - 1):
+    for c in portion(len(bounds) - 1, share):
         own = np.empty((ROWS, G), np.float32)
         first = np.empty((ROWS, F), np.float32)
         x = np.empty((blocks + 1, ROWS, H), np.float32)

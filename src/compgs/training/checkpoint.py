@@ -23,7 +23,6 @@ from compgs.scene.capture import check_camera
 from compgs.scene.points import COORDINATE_BITS
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
-from compgs.training.decorrelation import keep_channels
 from compgs.training.restoring import (
     check_moments,
     check_step,
@@ -117,11 +116,18 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     (voxel_size, distance_unit) = finite([scene["voxel_size"], scene["distance_unit"]], 2, "units", above=0.0)
     red, green, blue = finite(scene["background"], 3, "background")
     x, y, z = finite(scene["world_offset"], 3, "world_offset")
-    model = TrainedModel(config, coordinates, voxel_size, distance_unit, (red, green, blue), (x, y, z))
+    model = TrainedModel(
+        config,
+        coordinates,
+        voxel_size,
+        distance_unit,
+        (red, green, blue),
+        (x, y, z),
+        reference_dim=references.shape[1],
+    )
     model.viewpoints = tuple(_camera(entry) for entry in scene["viewpoints"])
     up_x, up_y, up_z = finite(scene["up"], 3, "up")
     model.up = (up_x, up_y, up_z)
-    keep_channels(model, torch.arange(model.reference_dim) < references.shape[1])
     check_tensors(tensors, model.state_dict(), "model")
     model.load_state_dict(tensors)
     return model

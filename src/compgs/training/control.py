@@ -21,7 +21,6 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
-from compgs.entropy.models import starting_residuals
 from compgs.tensors.prediction import Prediction
 from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import replace_rows
@@ -104,7 +103,7 @@ class AdaptiveControl:
     @torch.no_grad()
     def observe(self, rows: Tensor, prediction: Prediction, mean_gradient: Tensor, camera: Camera) -> None:
         """One training view: visible anchors [V], their prediction, gradient of the loss by the 2D means [M, 2]."""
-        k = self.config.model.coupled_primitives
+        k = self.gradient.shape[1]
         norms = torch.hypot(
             mean_gradient[:, 0] * (camera.width / 2), mean_gradient[:, 1] * (camera.height / 2)
         )
@@ -173,7 +172,7 @@ class AdaptiveControl:
         self, model: TrainedModel, means: Tensor, gradient: Tensor, noise: torch.Generator, lmbda: float
     ) -> dict[str, Tensor]:
         """New anchors by name of their parameter. gradient: [N, K] mean norms, 0 where not judged."""
-        c, k = self.config.control, self.config.model.coupled_primitives
+        c, k = self.config.control, model.dimensions.coupled_primitives
         flat = gradient.view(-1)
         target = torch.round(means.view(-1, 3) / model.voxel_size)
         inside = (target.abs() < COORDINATE_LIMIT - 16).all(1)
@@ -203,7 +202,7 @@ class AdaptiveControl:
             "coordinates": torch.cat(coordinates).to(torch.int32),
             "references": torch.cat(references),
             "log_scales": torch.cat(log_scales),
-            "residuals": starting_residuals(model.entropy, self.config.model).repeat(new, 1),
+            "residuals": model.entropy.starting_residuals().repeat(new, 1),
             "mask": model.mask.new_ones(new, k),
         }
 

@@ -14,10 +14,12 @@ OTHER_BYTES = 600  # names of tensors, scene, tables, metadata, container, about
 LENS_BYTES, VIEWPOINT_BYTES = 32, 13  # of the cameras that the file keeps
 
 
-def latent_bytes(model: TrainedModel) -> float:
-    """Bytes of latents and positions; not finite if the latents are not."""
-    anchors = int(model.mask.any(1).sum())
-    return (sum(model.estimated_bits().values()) + POSITION_BITS * anchors) / 8
+def latent_bytes(model: TrainedModel, mask: Tensor | None = None) -> float:
+    """Bytes of latents and positions, if the coupled primitives of `mask` [N, K] bool existed (default: those that do);
+    not finite if the latents are not.
+    """
+    anchors = int((model.mask if mask is None else mask).any(1).sum())
+    return (sum(model.estimated_bits(mask).values()) + POSITION_BITS * anchors) / 8
 
 
 @torch.no_grad()

@@ -6,11 +6,10 @@ from functools import partial
 
 import numpy as np
 import torch
-from numba import prange
 from torch import Tensor, nn
 
 from compgs.config import TrainingConfig
-from compgs.numerics.compiled import njit
+from compgs.numerics.compiled import njit, portion
 from compgs.trained_model import TrainedModel
 
 HEAD_GROUPS = ("geometry", "appearance", "translation", "covariance", "opacity", "color")
@@ -132,9 +131,9 @@ def adam_rows(
 
 
 @njit(parallel=True, fastmath={"contract", "nsz", "arcp"}, error_model="numpy")
-def _adam_rows(rows, parameter, gradient, first, second, numbers):
+def _adam_rows(rows, parameter, gradient, first, second, numbers, share):
     """`adam_rows` on the CPU in one pass. numbers: rate and epsilon with the bias corrections in them, 1 - betas."""
-    for chunk in prange(ROW_CHUNKS):
+    for chunk in portion(ROW_CHUNKS, share):
         rate, new1, new2, epsilon = numbers[0], numbers[1], numbers[2], numbers[3]
         for i in range(len(rows) * chunk // ROW_CHUNKS, len(rows) * (chunk + 1) // ROW_CHUNKS):
             r = rows[i]

@@ -62,20 +62,18 @@ class TargetSize:
         target = max(1, t.target_bytes - fixed)
         return follow(state, size * state.share, target, progress=step / t.steps, grown=grown)
 
-    def size(self) -> float:
-        """Bytes of the file that depend on lambda: latents and positions, without the networks."""
-        bits = latent_bytes(self.model)
-        return math.floor(bits) if math.isfinite(bits) else bits
+    def size(self, mask: Tensor | None = None) -> float:
+        """Bytes of the file that depend on lambda: latents and positions, without the networks. `mask`: [N, K] bool, of
+        the coupled primitives that are to exist; default: those that do.
+        """
+        found = latent_bytes(self.model, mask)
+        return math.floor(found) if math.isfinite(found) else found
 
     def lasting_share(self, lmbda: float, step: int) -> float:
         """Predicted share of the bytes of `size` that is left at the end of the run, after the last pruning."""
-        model, size = self.model, self.size()
+        size = self.size()
         total = self.contributions()
         still = sum(at >= step for at in self.pruned_at)
         kept = worth_keeping(total.sum(1), 1.0 - (1.0 - pruned_share(self.config, lmbda)) ** still)
-        mask = model.mask
-        try:
-            model.mask = missed(total, self.config.control.idle_share) & kept[:, None]
-            return self.size() / size if model.mask.any() else 1.0
-        finally:
-            model.mask = mask
+        lasting = missed(total, self.config.control.idle_share) & kept[:, None]
+        return self.size(lasting) / size if lasting.any() else 1.0

@@ -28,7 +28,13 @@ from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
-from compgs.tensors.prediction import Prediction, camera_center, choosing_pays, predict
+from compgs.tensors.prediction import (
+    Prediction,
+    camera_center,
+    choosing_pays,
+    predict,
+    predict_geometry,
+)
 from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
 from compgs.training.checkpoint import (
@@ -40,6 +46,7 @@ from compgs.training.checkpoint import (
     save_checkpoint,
 )
 from compgs.training.control import AdaptiveControl, make_schedule
+from compgs.training.culling import MEASURED_AT_ONCE, AnchorBounds
 from compgs.training.decorrelation import channel_rates, decorrelate, drop_silent_channels
 from compgs.training.dropout import share_left_out, thinned
 from compgs.training.events import Event, at_shares
@@ -122,6 +129,7 @@ class Trainer:
         self.scene = local_scene(scene, self.model.world_offset)
         self.optimizer = make_optimizer(self.model, t)
         self.schedule = make_schedule(config.control, t.steps, views)
+        self.bounds = AnchorBounds(self.model, self.geometry)
         self.control = AdaptiveControl(config, self.schedule, self.model.anchors, device)
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
         self.noise = UniformNoise(t.seed + 3, self.views.chance, device)
@@ -167,11 +175,8 @@ class Trainer:
     @torch.no_grad()
     def visible_anchors(self, camera: Camera) -> Tensor:
         """[V] int64: anchors whose primitives may be in the image."""
-        model = self.model
-        # The reach of an anchor: offsets of a few units, primitives of at most three of their sizes.
-        sizes = model.log_scales.exp() * model.voxel_size
-        radii = 2.0 * sizes[:, :3].amax(1) + 3.0 * sizes[:, 3:].amax(1)
-        return torch.nonzero(visible_mask(model.positions(), radii, camera, self.settings)).view(-1)
+        positions, radii = self.model.positions(), self.bounds.radii()
+        return torch.nonzero(visible_mask(positions, radii, camera, self.settings)).view(-1)
 
     def quantize(self, rows: Tensor) -> Quantized:
         """Latents of the anchors in view as the decoder will have them, and their bits (Sec. 3.3)."""
@@ -222,25 +227,11 @@ class Trainer:
         """D + lambda R (Eq. 1), once the rate has joined the loss; with lambda 0 only the entropy model learns R."""
         if not latents.bits:
             return distortion
-        r = rate(latents.bits, self.channels(), self.config.training.rate)
+        r = rate(latents.bits, self.model.entropy.channels, self.config.training.rate)
         if self.rate.lmbda > 0:
             return rate_distortion_loss(distortion, r, self.rate.lmbda)
         r.backward(inputs=self.model.entropy.statistics(), retain_graph=True)
         return distortion
-
-    def channels(self) -> dict[str, int]:
-        """Symbols that each stream codes for an anchor, by the stream's name."""
-        m, e = self.config.model, self.config.entropy
-        own = {
-            "residual_hyper": m.coupled_primitives,
-            "residual": m.coupled_primitives * m.residual_dim,
-        }
-        return {
-            "reference_hyper": e.reference_hyper_dim,
-            "reference": self.model.reference_dim,
-            "covariance": 6,
-            **(own if m.residuals else {}),
-        }
 
     def backward(
         self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians, latents: Quantized
@@ -272,7 +263,9 @@ class Trainer:
         for event in self.events:
             if event.due(self.step):
                 event.act()
+                self.bounds.forget()
         self.step += 1
+        self.bounds.after_step(self.step)
         self.rate = self.target_size.follow(self.rate, self.step)
 
     def skip(self, photograph: Target) -> StepResult:
@@ -290,14 +283,16 @@ class Trainer:
     @torch.no_grad()
     def coupled_means(self) -> Tensor:
         """[N, K, 3] world units: where the coupled primitives are now."""
-        model, k = self.model, self.config.model.coupled_primitives
-        parts = []
-        for rows in torch.arange(model.anchors, device=self.device).split(20_000):
-            p = model.primitives(model.quantized(rows, stored_weights=False), rows)
-            raw = model.heads.raw_geometry(p.references, p.residuals, p.anchor_index)
-            means = p.positions[p.anchor_index] + raw[:, :3] * p.reach[p.anchor_index]
-            parts.append(means.view(-1, k, 3))
-        return torch.cat(parts)
+        k = self.model.dimensions.coupled_primitives
+        every = torch.arange(self.model.anchors, device=self.device).split(MEASURED_AT_ONCE)
+        return torch.cat([self.geometry(rows)[0].view(-1, k, 3) for rows in every])
+
+    @torch.no_grad()
+    def geometry(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and scales [V * K, 3] of all coupled primitives of the anchors in `rows` [V] int64, world units."""
+        p = self.model.primitives(self.model.quantized(rows, stored_weights=False), rows)
+        means, scales, _ = predict_geometry(self.model.heads, p, p.residuals, p.anchor_index)
+        return means, scales
 
     def prune(self) -> None:
         """Remove the anchors that add least to the training views: what is left of the run makes up for them."""
@@ -323,7 +318,7 @@ class Trainer:
                 return None
             return rows, self.predict(self.model.quantized(rows), rows, camera, stored=True)
 
-        shape = self.model.anchors, self.config.model.coupled_primitives
+        shape = self.model.anchors, self.model.dimensions.coupled_primitives
         views = spread(self.scene.train_views, most)
         return view_contributions(views, predicted, shape, self.settings, self.device)
 
@@ -360,6 +355,7 @@ class Trainer:
 
     def finish(self) -> None:
         """Drop coupled primitives that training views hardly see, or not at all, and anchors that have none left."""
+        self.bounds.forget()
         everything = self.contributions(most=len(self.scene.train_views))
         self.model.mask = missed(everything, self.config.control.idle_share)
         if not self.model.mask.any():
@@ -373,6 +369,8 @@ class Trainer:
         extra |= self.views.tensors()
         if self.reference_rates is not None:
             extra["reference_rates"] = self.reference_rates
+        if self.bounds.measured is not None:
+            extra["bounds"] = self.bounds.measured
         state = {
             "step": self.step,
             **self.views.state(),
@@ -395,6 +393,10 @@ class Trainer:
                 rates = checkpoint.extra["reference_rates"]
                 check_tensor(rates, (trainer.model.reference_dim,), torch.float32, "reference_rates")
                 trainer.reference_rates = rates.to(device)
+            if "bounds" in checkpoint.extra:
+                bounds = checkpoint.extra["bounds"]
+                check_tensor(bounds, (trainer.model.anchors,), torch.float32, "bounds")
+                trainer.bounds.measured = bounds.to(device)
             restore_chance(trainer.chance, checkpoint.extra)
             trainer.views.restore(checkpoint.state, checkpoint.extra)
             trainer.step = checkpoint.state["step"]

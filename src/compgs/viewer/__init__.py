@@ -1,6 +1,6 @@
 """Scenes in a browser: pages that need no server (page, gallery), and a viewer that this process renders for (live)."""
 
-from compgs.errors import MissingDependency, install_line
+from compgs.extras import require
 from compgs.viewer.page import html_page
 
 __all__ = ["check_viewer", "html_page"]
@@ -8,7 +8,4 @@ __all__ = ["check_viewer", "html_page"]
 
 def check_viewer() -> None:
     """Raises MissingDependency, with the remedy, where no live viewer can be opened."""
-    try:
-        import viser  # noqa: F401
-    except ImportError as error:
-        raise MissingDependency(f"the viewer needs viser: {install_line('view')}") from error
+    require("view", "the viewer")

@@ -30,7 +30,8 @@ DRIVER = """<script>
     const beside = [...document.querySelectorAll(".beside img")].filter((p) => getComputedStyle(p).display != "none");
     seen[step] = [getComputedStyle(stage).getPropertyValue("--cut"), handle.getAttribute("aria-valuenow"),
       shown("left"), shown("right"), beside.map((picture) => picture.alt).join(),
-      Math.round(handle.getBoundingClientRect().left + 1 - box.left)];
+      Math.round(handle.getBoundingClientRect().left + 1 - box.left),
+      getComputedStyle(stage.querySelector("img.left")).clipPath];
   };
   const pointer = (kind, target, share, more) => target.dispatchEvent(new PointerEvent(kind, { bubbles: true,
     cancelable: true, isPrimary: true, clientX: box.left + share * box.width, clientY: box.top + 5, ...more }));
@@ -62,7 +63,7 @@ DRIVER = """<script>
   choose("left", 2); look("blue on both sides");
   choose("right", 0); look("red on the right");
   const focused = document.activeElement === handle;
-  document.title = JSON.stringify({ seen, focused, clip: getComputedStyle(stage.querySelector("img.left")).clipPath });
+  document.title = JSON.stringify({ seen, focused });
 </script></body>"""
 
 
@@ -108,9 +109,10 @@ def test_the_line_follows_mouse_finger_and_keys(browser: str, tmp_path: Path) ->
         assert seen[step][5] == pytest.approx(1.2 * cut, abs=1), step  # two pixels a pixel: 120 across
     assert seen["blue on the right"][2:5] == ["red", "blue", "errors of blue"]
     assert seen["blue on both sides"][2:5] == ["blue", "blue", "errors of blue"]
+    assert seen["blue on both sides"][6] == "none"  # the whole picture is seen
     # Of a photograph there are no errors: those of the other picture are shown.
     assert seen["red on the right"][2:5] == ["blue", "red", "errors of blue"]
-    assert found["focused"] and found["clip"].startswith("inset(0px 100% 0px 0px)")
+    assert found["focused"] and seen["home key"][6].startswith("inset(0px 100% 0px 0px)")
 
 
 def test_both_pictures_are_seen_where_the_page_says(browser: str, tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def scale_for(differences: Sequence[np.ndarray]) -> int:
 
 def difference_picture(levels: np.ndarray, scale: int) -> np.ndarray:  # [H, W, 3] uint8
     """Black where two images agree, white where they differ by `scale` levels or more."""
-    place = np.clip(levels / scale, 0.0, 1.0) * (len(COLORS) - 1)
+    place = levels / scale * (len(COLORS) - 1)
     knots = np.arange(len(COLORS))
     channels = [np.interp(place, knots, COLORS[:, i]) for i in range(3)]
     return np.stack(channels, axis=2).round().astype(np.uint8)

@@ -1,0 +1,78 @@
+"""Threads that share the work of a kernel.
+
+A parallel kernel of the package is an ordinary compiled function, whose last argument says which share of its loop it
+is to do. (numba can divide loops itself: compiling takes three times as long then, and its threads serve one caller
+at a time.) The caller does the first share, the crew's threads the others; as many as `numba.set_num_threads` says.
+"""
+
+import os
+import threading
+from collections.abc import Callable
+from queue import SimpleQueue
+
+Share = tuple[int, int]  # (which, of how many)
+ALL: Share = (0, 1)
+
+
+class Crew:
+    """Threads that wait for work. They are started when they are first needed, and end with the process."""
+
+    def __init__(self) -> None:
+        self.start_anew()
+
+    def start_anew(self) -> None:
+        """Forget the threads: after a fork there are none."""
+        self._work: SimpleQueue[_Task] = SimpleQueue()
+        self._members = 0
+        self._hiring = threading.Lock()
+
+    def do(self, work: Callable[[Share], None], count: int) -> None:
+        """`work((i, count))` for each i below count, at the same time. Raises what a share raised, once all ended."""
+        self._grow(count - 1)
+        done: SimpleQueue[BaseException | None] = SimpleQueue()
+        for i in range(1, count):
+            self._work.put((work, (i, count), done))
+        error = _attempt(work, (0, count))
+        for _ in range(1, count):
+            # Kernels cannot be stopped: Ctrl-C, too, waits for those that write into the caller's arrays.
+            error = _take(done) or error
+        if error is not None:
+            raise error
+
+    def _grow(self, members: int) -> None:
+        if self._members < members:
+            with self._hiring:
+                while self._members < members:
+                    name = f"compgs-{self._members + 1}"
+                    threading.Thread(target=self._serve, name=name, daemon=True).start()
+                    self._members += 1
+
+    def _serve(self) -> None:
+        while True:
+            work, share, done = self._work.get()
+            done.put(_attempt(work, share))
+            del work, done  # the caller's arrays are not held until the next task
+
+
+_Task = tuple[Callable[[Share], None], Share, SimpleQueue]
+
+
+def _attempt(work: Callable[[Share], None], share: Share) -> BaseException | None:
+    try:
+        work(share)
+    except BaseException as error:
+        return error
+    return None
+
+
+def _take(done: "SimpleQueue[BaseException | None]") -> BaseException | None:
+    """What a share raised; an interruption that comes meanwhile, once the share ended."""
+    try:
+        return done.get()
+    except KeyboardInterrupt as stop:
+        return done.get() or stop
+
+
+CREW = Crew()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=CREW.start_anew)
