@@ -29,6 +29,7 @@ started = time.time()
 _HOME = {
     "load_scene": "compgs.scene",
     "train": "compgs.methods",
+    "compress": "compgs.compressing",
     "encode": "compgs.codec",
     "decode": "compgs.codec",
     "render": "compgs.render",
@@ -49,6 +50,7 @@ __all__ = [
     "Gaussians",
     "__version__",
     "compare",
+    "compress",
     "decode",
     "encode",
     "evaluate",
@@ -64,6 +66,7 @@ __all__ = [
 if TYPE_CHECKING:
     from compgs.cameras import Camera
     from compgs.codec import decode, encode
+    from compgs.compressing import compress
     from compgs.config import load_config
     from compgs.errors import CompGSError
     from compgs.evaluation import compare as compare

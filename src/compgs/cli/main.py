@@ -16,6 +16,7 @@ from compgs.cli.benchmark import Benchmark
 from compgs.cli.command import Command
 from compgs.cli.compare import Compare
 from compgs.cli.compiling import say_when_compiling
+from compgs.cli.compress import Compress
 from compgs.cli.console import console, errors, show_whatever_can_be_shown
 from compgs.cli.decode import Decode
 from compgs.cli.demo_scene import DemoScene
@@ -36,6 +37,7 @@ from compgs.interrupt import Terminated, ended_on_request, held_back
 COMMANDS: tuple[type[Command], ...] = (
     Reconstruct,
     Train,
+    Compress,
     Encode,
     Decode,
     Render,

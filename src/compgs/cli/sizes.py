@@ -1,4 +1,4 @@
-"""Sizes of files and other counts as people type them."""
+"""Sizes of files, times and other counts as people type them."""
 
 import re
 
@@ -6,6 +6,20 @@ from compgs.cli.usage import UsageError
 from compgs.config import MAX_VIEWPOINTS
 
 UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30}
+
+SECONDS = {"": 1, "s": 1, "sec": 1, "m": 60, "min": 60, "h": 3600}
+
+
+def parse_time(text: str, option: str) -> float:
+    """Seconds of `5min`, `90s`, `1.5h`, `1h30min` or `300`. Raises UsageError that names the option."""
+    parts = re.findall(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]*)\s*", text)
+    whole = re.fullmatch(r"\s*(?:(?:\d+(?:\.\d*)?|\.\d+)\s*[A-Za-z]*\s*)+", text)
+    if whole is None or any(unit.lower() not in SECONDS for _, unit in parts):
+        raise UsageError(f"{option} {text}: expected a time such as 5min, 90s, 1.5h or 1h30min")
+    seconds = sum(float(count) * SECONDS[unit.lower()] for count, unit in parts)
+    if not seconds > 0:
+        raise UsageError(f"{option} {text}: expected more than no time")
+    return seconds
 
 
 def parse_size(text: str, option: str) -> int:

@@ -18,8 +18,9 @@ def contact_sheet(
         tuple[np.ndarray, np.ndarray, str, float]
     ],  # photograph, rendering [H, W, 3] uint8, name, PSNR in dB
     title: str,
+    truth: str = "photograph",  # what stands on the left
 ) -> np.ndarray:  # [H', W', 3] uint8
-    """One row a view: the photograph on the left, the rendering on the right, labels above."""
+    """One row a view: the photograph, or what stands for it, on the left, the rendering on the right, labels above."""
     font = ImageFont.load_default(TEXT)
     pairs = [(_reduced(photograph), _reduced(rendering)) for photograph, rendering, _, _ in rows]
     column = max(COLUMN_WIDTH, *(left.width for left, _ in pairs))
@@ -31,7 +32,7 @@ def contact_sheet(
     draw.text((MARGIN, MARGIN), _drawable(title), fill=INK, font=font)
     top = label
     for (left, right), (_, _, name, psnr) in zip(pairs, rows, strict=True):
-        draw.text((MARGIN, top + MARGIN), _drawable(f"{name}: photograph"), fill=INK, font=font)
+        draw.text((MARGIN, top + MARGIN), _drawable(f"{name}: {truth}"), fill=INK, font=font)
         draw.text(
             (column + 2 * MARGIN, top + MARGIN), f"decoded file, PSNR {psnr:.2f} dB", fill=INK, font=font
         )

@@ -43,6 +43,7 @@ def evaluate(
     progress: Callable[[int, int], None] | None = None,
     method: str | None = None,
     exposure: bool = False,
+    truth: str = "photograph",
 ) -> Results:
     """Open a file of any known format (`compgs.formats`) and compare its renderings with a scene's held-out views.
 
@@ -52,7 +53,7 @@ def evaluate(
     a pixel counts) and `contact_sheet.png` are written there.
     `progress(done, total)` is called after each view; `method` is noted: which one wrote the file. Where the file tells
     that it was made from another scene, or from views or sizes of images other than these, `notes` of the results say
-    so.
+    so. `truth`: what the views' images are, as the contact sheet calls them.
 
     Pixels that a view's mask leaves out do not count. With `exposure`, for scenes that were trained with exposures of
     their views, each rendering gets that of its view first, fitted to the left half, and the right half is measured
@@ -125,7 +126,7 @@ def evaluate(
         notes=misfits(model.viewpoints, scene),
     )
     if output is not None:
-        write_evaluation(Path(output), results, scene.test_views, images)
+        write_evaluation(Path(output), results, scene.test_views, images, truth)
     return results
 
 
@@ -157,7 +158,11 @@ def timed_render(model: Renderable, camera: Camera) -> tuple[np.ndarray, float]:
 
 
 def write_evaluation(
-    folder: Path, results: Results, views: tuple[View, ...], images: list[np.ndarray]
+    folder: Path,
+    results: Results,
+    views: tuple[View, ...],
+    images: list[np.ndarray],
+    truth: str = "photograph",
 ) -> None:
     """The files of an evaluation; images of an earlier one with more views are removed."""
     written: set[Path] = set()
@@ -188,6 +193,7 @@ def write_evaluation(
             for i in chosen
         ],
         f"{results.scene}: {results.bytes / 1000:.1f} kB, {results.psnr:.2f} dB, {len(views)} held-out views",
+        truth,
     )
     write_bytes(folder / "contact_sheet.png", encode_png(sheet))
     write_json(folder / "cameras.json", [camera_entry(view.camera, view.name) for view in views])

@@ -1,0 +1,25 @@
+"""From splats to a small file, without photographs: the splats are rendered, and the renderings are trained on.
+
+`compgs.compress(source, output)` does it all; `begin`, `Compression.train` and `Compression.judge` are its parts.
+"""
+
+from compgs.compressing.compression import (
+    Compressed,
+    Compression,
+    begin,
+    compress,
+    default_config,
+    resumed,
+)
+from compgs.compressing.run import Looking, folder_of
+
+__all__ = [
+    "Compressed",
+    "Compression",
+    "Looking",
+    "begin",
+    "compress",
+    "default_config",
+    "folder_of",
+    "resumed",
+]

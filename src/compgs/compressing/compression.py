@@ -1,0 +1,267 @@
+"""From a file of splats to a small .cgs file: the whole way, in the order in which it is gone.
+
+splats ──place cameras──► views ──train──► model ──encode──► .cgs ──┐
+   └──────────────── rendered by cameras not trained on ────────────┴──► PSNR, SSIM, beside .spz and .sog
+"""
+
+import hashlib
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compgs.codec import encode
+from compgs.compressing import run
+from compgs.compressing.comparison import Compared, compare
+from compgs.compressing.given import given_cameras
+from compgs.compressing.pace import steps_within
+from compgs.compressing.placing import Placed, between, place_cameras
+from compgs.compressing.run import Begun, Looking, folder_of
+from compgs.compressing.start import seen_weights, start_points
+from compgs.compressing.surroundings import Lens
+from compgs.compressing.teacher import teacher_scene
+from compgs.config import Config, check_config, load_config
+from compgs.devices import chosen_device
+from compgs.errors import CheckpointError, ConfigError, NotACompGSFile, OutputError
+from compgs.evaluation import evaluate
+from compgs.evaluation.results import Results
+from compgs.formats import component_bytes, format_of, open_scene
+from compgs.methods import train
+from compgs.model.splats import SplatModel
+from compgs.outputs import check_output_file, check_output_folder, write_json
+from compgs.scene.views import Scene
+from compgs.training import TrainingStatus
+from compgs.training.checkpoint import CHECKPOINT_NAME
+
+SPLATS_PER_ANCHOR = 4.0  # at the start; growth adds anchors, pruning removes them
+HELD_OUT_EVERY = 8  # of given cameras, by name: as scenes are split (`load_scene`)
+FOR_THE_REST = 0.1  # of a given time: the last look at all views, and writing the file
+NEEDED_BYTES = 64 << 20  # checkpoint, file and pictures of a small scene
+STEPS = 8000  # unless a preset or a time is asked for: minutes on two cores
+
+Progress = Callable[[int, int], None]  # done, of how many
+
+
+@dataclass(frozen=True, eq=False)
+class Compressed:
+    """A file of splats, made small, and what that lost: all figures are of the written file, read again."""
+
+    source: Path
+    source_bytes: int
+    splats: int
+    file: Path
+    folder: Path  # of checkpoint, results and pictures
+    steps: int
+    results: Results  # on cameras that were not trained on
+    others: tuple[Compared, ...]  # the same splats in other formats, by the same measure
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of `results.json`: that of an evaluation, and `compress`."""
+        return self.results.to_dict() | {
+            "compress": {
+                "source": self.source.name,
+                "source_bytes": self.source_bytes,
+                "source_splats": self.splats,
+                "steps": self.steps,
+                "others": [asdict(each) for each in self.others],
+            }
+        }
+
+
+def compress(
+    source: str | Path,
+    output: str | Path,
+    *,
+    config: Config | None = None,
+    preset: str | None = None,
+    looking: Looking | None = None,
+    seconds: float | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    device: str | None = None,
+    on_progress: Callable[[TrainingStatus], None] | None = None,
+) -> Compressed:
+    """Write splats (.ply, .spz, .splat, .sog, .glb) as a .cgs file, by training on renderings of them.
+
+    Settings are those of `config`, or of a preset; of neither, those of `default` with STEPS steps. With `seconds` the
+    number of steps is chosen, before the training, so that the file is there after about that long. `looking` says from
+    where the splats are looked at: places are found where there is something to see, unless cameras are named.
+
+    Beside the file, in `folder_of(output)`, are a checkpoint, from which `resume` goes on with the settings it began
+    with, `results.json`, `per_view.json`, `cameras.json`, pictures and `contact_sheet.png`.
+
+    Raises SplatFileError, NotACompGSFile, SceneError, ConfigError, CheckpointError, OutputError, TrainingError.
+    """
+    output, source = Path(output), Path(source)
+    if resume:
+        compression = resumed(output, source, device=device)
+    else:
+        if config is not None and preset is not None:
+            raise ConfigError(f"config and preset={preset!r} were both given: give one")
+        chosen = config or default_config(preset)
+        compression = begin(
+            source, output, chosen, looking, seconds=seconds, overwrite=overwrite, device=device
+        )
+    compression.train(on_progress)
+    return compression.judge()
+
+
+def default_config(preset: str | None = None) -> Config:
+    """Of a preset, or what is meant for compression."""
+    if preset is not None:
+        return load_config(preset)
+    config = load_config("default")
+    return replace(config, training=replace(config.training, steps=STEPS))
+
+
+@dataclass(frozen=True, eq=False)
+class Compression:
+    """A compression that has begun: its scene is there, to train on and to judge by."""
+
+    begun: Begun
+    splats: SplatModel
+    scene: Scene
+    file: Path
+    device: str
+    goes_on: bool = False  # from a checkpoint
+
+    def train(self, on_progress: Callable[[TrainingStatus], None] | None = None) -> int:
+        """Train, or go on with it, and write the file; its bytes. Raises TrainingError, OutputError."""
+        model = train(
+            self.scene,
+            self.begun.config,
+            output=folder_of(self.file),
+            resume=self.goes_on,
+            on_progress=on_progress,
+            device=self.device,
+        )
+        return encode(model, self.file, overwrite=True).bytes
+
+    def judge(self, progress: Progress | None = None) -> Compressed:
+        """The written file, and other formats, against the splats; all that is found is written down, too."""
+        folder = folder_of(self.file)
+        results = evaluate(
+            self.file,
+            self.scene,
+            output=folder,
+            overwrite=True,
+            device=self.device,
+            progress=progress,
+            truth=self.begun.source.name,
+        )
+        compressed = Compressed(
+            source=self.begun.source,
+            source_bytes=sum(component_bytes(self.begun.source).values()),
+            splats=len(self.splats.splats),
+            file=self.file,
+            folder=folder,
+            steps=self.begun.config.training.steps,
+            results=results,
+            others=compare(self.splats, self.scene.test_views, device=self.device),
+        )
+        write_json(folder / "results.json", compressed.to_dict())
+        return compressed
+
+
+def begin(
+    source: Path,
+    output: Path,
+    config: Config,
+    looking: Looking | None = None,
+    *,
+    seconds: float | None = None,
+    overwrite: bool = False,
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> Compression:
+    """Find cameras, start anchors, and choose the steps if `seconds` are given. Raises as `compress` does."""
+    start = time.perf_counter()
+    check_config(config)
+    looking = looking or Looking()
+    looking.check()
+    if seconds is not None and not seconds > 0:
+        raise ConfigError(f"seconds = {seconds}: expected more than none")
+    check_places(output, overwrite=overwrite)
+    splats = opened(source, looking, device)
+    placed = placed_cameras(splats, looking, config.training.seed, progress)
+    scene, size = scene_of(splats, placed, source, config)
+    config = replace(config, model=replace(config.model, voxel_size=size))
+    if seconds is not None:
+        left = seconds * (1 - FOR_THE_REST) - (time.perf_counter() - start)
+        steps = steps_within(scene, config, left, device)
+        config = replace(config, training=replace(config.training, steps=steps))
+    begun = Begun(source, digest(source), looking, placed, config)
+    run.save(folder_of(output), begun)
+    return Compression(begun, splats, scene, output, chosen_device(device))
+
+
+def resumed(output: Path, source: Path | None = None, *, device: str | None = None) -> Compression:
+    """Go on with what is in `folder_of(output)`; a `source` says where the splats are now.
+
+    Raises CheckpointError if there is nothing to go on with, or the splats are others.
+    """
+    check_places(output, overwrite=True)
+    folder = folder_of(output)
+    begun = run.load(folder)
+    if source is not None:
+        begun = replace(begun, source=source)
+    splats = opened(begun.source, begun.looking, device)
+    if digest(begun.source) != begun.sha256:
+        raise CheckpointError(
+            f"{begun.source}: not the splats that {output} was begun with; compress them anew"
+        )
+    scene, _ = scene_of(splats, begun.placed, begun.source, begun.config)
+    there = (folder / CHECKPOINT_NAME).is_file()
+    return Compression(begun, splats, scene, output, chosen_device(device), goes_on=there)
+
+
+def check_places(output: Path, *, overwrite: bool) -> None:
+    """Raises OutputError, before anything is done, for a file or folder that cannot be written."""
+    if output.suffix != ".cgs":
+        raise OutputError(f"{output}: expected a name that ends in .cgs")
+    check_output_file(output, overwrite=overwrite)
+    check_output_folder(folder_of(output), overwrite=overwrite, needed_bytes=NEEDED_BYTES)
+
+
+def opened(source: Path, looking: Looking, device: str | None) -> SplatModel:
+    """The splats of a file. Raises SplatFileError, NotACompGSFile."""
+    if format_of(source).name == "cgs":
+        raise NotACompGSFile(
+            f"{source}: a .cgs file is compressed already; `compgs encode` makes one smaller without training"
+        )
+    model = open_scene(source, chosen_device(device), looking.background)
+    assert isinstance(model, SplatModel), type(model)
+    return model
+
+
+def digest(source: Path) -> str:
+    """By which a file is known again."""
+    return hashlib.sha256(source.read_bytes()).hexdigest()
+
+
+def placed_cameras(
+    splats: SplatModel, looking: Looking, seed: int, progress: Progress | None = None
+) -> Placed:
+    """Cameras that are placed, or those that are given and more between them. Raises SceneError."""
+    if looking.cameras is None:
+        lens = Lens(looking.width, looking.height)
+        count = looking.views, looking.held_out
+        return place_cameras(splats, *count, lens=lens, up=looking.up, seed=seed, progress=progress)
+    given = [looking.fitted(camera) for camera in given_cameras(looking.cameras)]
+    trained = [camera for i, camera in enumerate(given) if i % HELD_OUT_EVERY]
+    more = max(0, looking.views - len(trained))
+    added = between(splats, trained, more, np.random.default_rng(seed)) if len(trained) > 1 else []
+    return Placed((*trained, *added), tuple(given[::HELD_OUT_EVERY]))
+
+
+def scene_of(splats: SplatModel, placed: Placed, source: Path, config: Config) -> tuple[Scene, float]:
+    """What training sees, and the size of its voxels in world units."""
+    anchors = max(1, round(len(splats.splats) / SPLATS_PER_ANCHOR))
+    weights = seen_weights(splats, placed.train)
+    points, size = start_points(
+        splats, weights, min(anchors, config.model.max_anchors), config.model.voxel_size
+    )
+    return teacher_scene(splats, placed, points, source), size

@@ -1,0 +1,44 @@
+"""How many steps fit into a time: a few are tried, on the scene as it is, and thrown away."""
+
+import time
+from dataclasses import replace
+
+from compgs.config import Config
+from compgs.methods import train
+from compgs.scene.views import Scene
+from compgs.training import TrainingStatus
+
+TRIED = 40  # steps; the pace is that of the later ones
+TRIED_VIEWS = 12
+# A step of the whole run, in steps of its beginning: anchors grow, then most of them are pruned, and the rate is always
+# counted in (measured: docs/results/compress.md).
+WHOLE_RUN = 1.0
+FEWEST = 200  # steps: fewer make nothing that could be looked at
+
+
+def steps_within(scene: Scene, config: Config, seconds: float, device: str | None) -> int:
+    """Steps of a training that ends about `seconds` from now; FEWEST at least."""
+    start = time.perf_counter()
+    pace = seconds_per_step(scene, config, device)
+    left = seconds - (time.perf_counter() - start)
+    return max(FEWEST, int(left / (WHOLE_RUN * pace)))
+
+
+def seconds_per_step(scene: Scene, config: Config, device: str | None) -> float:
+    """Of a step with everything in it, after the first ones, which load and compile kernels."""
+    views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
+    last: list[TrainingStatus] = []
+    train(replace(scene, train_views=views), trial(config), device=device, on_progress=last.append)
+    return last[-1].seconds_per_step
+
+
+def trial(config: Config) -> Config:
+    """The first steps of a run with nothing in them that is not in every step, but with the rate."""
+    return replace(
+        config,
+        training=replace(
+            config.training, steps=TRIED, rate_start=0.0, target_bytes=None, quantized_weights=0.0
+        ),
+        control=replace(config.control, start=1.0, stop=0.0, prune_at=()),
+        entropy=replace(config.entropy, decorrelate_at=()),
+    )
