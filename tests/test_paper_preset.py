@@ -98,6 +98,7 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         "training.target_bytes": "",
         "training.quantized_weights": "how weights are stored",
         "training.sparse_adam": "off",
+        "training.exposure": "off",
         "training.appearance_dtype": "float32",
         "training.entropy_lr_steps": "bounds of short runs",
         "training.viewpoints": "what the file keeps beside the scene",
