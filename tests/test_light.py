@@ -86,12 +86,13 @@ folder = Path(sys.argv[1])
 for command in (
     ["train", str(folder), "-o", str(folder / "new")],
     ["encode", str(folder / "run"), "-o", str(folder / "run.cgs")],
+    ["compress", str(folder / "small.cgs"), "-o", str(folder / "new.cgs")],
     ["render", str(folder / "small.cgs"), "--device", "cuda", "-o", str(folder / "there")],
 ):
     assert main(command) == 1, command
 assert not (folder / "new").exists() and not (folder / "there").exists()
 import compgs
-for use in (lambda: compgs.train(folder), lambda: compgs.encode):
+for use in (lambda: compgs.train(folder), lambda: compgs.encode, lambda: compgs.compress):
     try:
         use()
     except compgs.CompGSError as error:
@@ -103,10 +104,15 @@ def test_what_is_missing_is_one_line_with_the_remedy_before_any_work(folder: Pat
     code, _, err = without_extras(MISSING, str(folder))
     assert code == 0, err
     lines = [" ".join(line.split()) for line in err.split("error:")[1:]]
-    assert len(lines) == 5
-    remedies = ["'.[train]'", "'.[train]'", "'.[cuda]'", "'.[train]'", "'.[train]'"]
+    assert len(lines) == 7
+    remedies = [*3 * ["'.[train]'"], "'.[cuda]'", *3 * ["'.[train]'"]]
     for line, remedy in zip(lines, remedies, strict=True):
-        needs = ("training needs torch, scipy and", "--device cuda: needs torch", "compgs.encode needs torch")
+        needs = (
+            "training needs torch, scipy and",
+            "--device cuda: needs torch",
+            "compgs.encode needs torch",
+            "compgs.compress needs torch",
+        )
         assert line.startswith(needs), line
         assert f"pip install {remedy} in the project's folder" in line
 

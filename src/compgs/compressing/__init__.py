@@ -3,7 +3,11 @@
 `compgs.compress(source, output)` does it all; `begin`, `Compression.train` and `Compression.judge` are its parts.
 """
 
-from compgs.compressing.compression import (
+from compgs.extras import require
+
+require("train", "compgs.compress")  # before anything below loads what may not be installed
+
+from compgs.compressing.compression import (  # noqa: E402
     Compressed,
     Compression,
     begin,
@@ -11,7 +15,7 @@ from compgs.compressing.compression import (
     default_config,
     resumed,
 )
-from compgs.compressing.run import Looking, folder_of
+from compgs.compressing.run import Looking, folder_of  # noqa: E402
 
 __all__ = [
     "Compressed",
