@@ -83,11 +83,13 @@ def test_a_worker_that_dies_costs_nothing_but_time_and_the_table_is_that_of_the_
     killed: list[int] = []
     killer = threading.Thread(target=kill_one_worker, args=(tmp_path / "cluster", killed))
     killer.start()
+    stops = signal.getsignal(signal.SIGTERM)
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
     try:
         cluster = benchmark(tiny, tmp_path / "cluster", data=data, cluster="local")
     finally:
         ray.shutdown()
+        signal.signal(signal.SIGTERM, stops)
         killer.join()
     assert len(killed) == 1
     assert serial.failed == cluster.failed == ()

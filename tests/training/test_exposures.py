@@ -66,7 +66,7 @@ def trained(kind: type, scene: Scene, config) -> tuple:
     trainer.run(None, None)
     if kind is Trainer:
         return trainer, trainer.model.as_hybrid_model()
-    return trainer, SplatModel(trainer.parameters.trained(), scene.background)
+    return trainer, SplatModel(trainer.parameters.trained().arrays(), scene.background)
 
 
 @pytest.mark.parametrize(("kind", "steps"), [(Trainer, 160), (SplatTrainer, 240)])

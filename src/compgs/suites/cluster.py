@@ -6,6 +6,8 @@ checkpoint of one run, and nothing else.
 """
 
 import logging
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -44,6 +46,7 @@ def run_on_cluster(
 
     needs = needs or Needs()
     own = not ray.is_initialized()
+    stops = signal.getsignal(signal.SIGTERM)
     if own:
         try:
             # Workers start with what this process can import; they print to their runs' folders.
@@ -55,6 +58,9 @@ def run_on_cluster(
             )
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise ConfigError(f"--cluster {address}: cannot be reached ({error}); is it running?") from error
+        finally:
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGTERM, stops)  # Ray has put its own in the place of ours
     try:
         task = ray.remote(num_cpus=needs.cpus, num_gpus=needs.gpus, max_retries=RETRIES)(run_job)
         waiting: dict[Any, Job] = {}
