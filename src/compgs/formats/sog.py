@@ -50,8 +50,8 @@ MOST_META_BYTES = 1 << 20
 # Images are about as large as the splats need; 16 384 pixels is the longest side of a WebP.
 SPARE_PIXELS = 1 << 16
 QUATERNION_TAG = 252
-# Of 100, what libwebp calls the quality of lossless images. 100 tries everything, in twenty times the time: it halves the
-# rotations of splats that lie alike, saves a tenth of the scales, and nothing elsewhere.
+# Of 100, what libwebp calls the quality of lossless images. 100 tries everything, in twenty times the time: it halves
+# the rotations of splats that lie alike, saves a tenth of the scales, and nothing elsewhere.
 CRUNCHED, USUAL = 100, 99
 _SQRT2 = math.sqrt(2)
 # Made at no time, so that the same splats are the same bytes.
