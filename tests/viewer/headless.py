@@ -25,6 +25,7 @@ DRIVER = """<script>(async () => {
   try {
     const viewer = window.compgsViewer;
     while (!text("error-text") && !text("status").includes(" in ")) await pause();
+    await post("seconds", String(performance.now() / 1000));
     const cameras = text("error-text") ? [] : %s;
     for (const [i, camera] of cameras.entries()) {
       await viewer.show(camera);
@@ -42,6 +43,14 @@ DRIVER = """<script>(async () => {
 
 def visit(browser: str, folder: Path, page: bytes, cameras: list[Camera]) -> tuple[list[np.ndarray], str]:
     """Pictures [H, W, 3] uint8 of the cameras, and what the page's error box says. `folder`: for the browser."""
+    pictures, error, _ = timed_visit(browser, folder, page, cameras)
+    return pictures, error
+
+
+def timed_visit(
+    browser: str, folder: Path, page: bytes, cameras: list[Camera]
+) -> tuple[list[np.ndarray], str, float]:
+    """The same, and the seconds from the page's first byte until it shows the whole scene (or an error)."""
     driver = DRIVER % json.dumps([_described(camera) for camera in cameras])
     page = page.replace(b"</body>", driver.encode())
     got: dict[str, bytes] = {}
@@ -81,7 +90,7 @@ def visit(browser: str, folder: Path, page: bytes, cameras: list[Camera]) -> tup
     assert ended, f"the page did not finish within {MAX_SECONDS} s; it sent {sorted(got)}"
     assert "failed" not in got, got["failed"].decode()
     pictures = [_picture(got[f"picture{i}"], c) for i, c in enumerate(cameras) if f"picture{i}" in got]
-    return pictures, got["done"].decode()
+    return pictures, got["done"].decode(), float(got["seconds"])
 
 
 def _described(camera: Camera) -> dict[str, object]:
