@@ -154,6 +154,23 @@ def test_every_anchor_lies_in_a_sphere_of_its_tile() -> None:
     assert np.isfinite(endless).all() and endless[:, 3].max() > 1e26
 
 
+def test_spheres_of_a_manifest_hold_the_anchors_far_from_the_origin_too(
+    cgs_bytes: bytes, tmp_path: Path
+) -> None:
+    """Rounded to the digits of the file, and to single precision, in which a view meets them."""
+    places = [(4e6, -3e5, 12.0), (4e6 + 2000.0, -3e5 + 700.0, 13.0)]
+    tiles = [NewTile(f"{i}", placed_at(cgs_bytes, place)) for i, place in enumerate(places)]
+    model = open_scene(write_tiles(tmp_path / "far.tiles", tiles))
+    centers, radii = (array.astype(np.float64) for array in model.bounds)
+    for index, place in enumerate(places):
+        tile = model.cache.get(index)
+        shift = np.subtract(place, model.world_offset).astype(np.float32)
+        positions = (tile.bounds[0] + shift).astype(np.float64)
+        reach = np.linalg.norm(positions[:, None] - centers, axis=2) + tile.bounds[1][:, None]
+        assert (reach <= radii).any(1).all()
+    assert radii.max() < 50
+
+
 def test_what_a_tile_is_said_to_take_is_what_its_arrays_take(folder: Path) -> None:
     model = open_tiles(folder / "manifest.json").cache.get(0)
     p, radii = model.primitives, model.bounds[1]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from compgs import extras
 from compgs.cli import train as train_command
 from compgs.cli.main import main
 from compgs.formats import component_bytes, open_scene
@@ -264,6 +266,38 @@ def test_a_viewer_shows_tiles(city: Path) -> None:
     assert shown.levels[0].startswith("all of it: ")
     assert isinstance(shown.model(0), TiledScene) and len(shown.cameras) == 12
     assert sum(component_bytes(city / "city.tiles").values()) > 5000
+
+
+@pytest.mark.slow
+def test_two_tiles_at_once_on_a_cluster_are_those_of_one_after_the_other(
+    scene: Path, city: Path, tmp_path: Path
+) -> None:
+    ray = pytest.importorskip("ray", reason="the extra `cluster` is not installed")
+    stops = signal.getsignal(signal.SIGTERM)
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
+    try:
+        options = ["--tiles", "2x1", "--cluster", "local", *OPTIONS]
+        assert main(["train", str(scene), "-o", str(tmp_path / "city"), *options]) == 0
+    finally:
+        ray.shutdown()
+        signal.signal(signal.SIGTERM, stops)
+    assert {json.loads(file.read_text())["tile"] for file in tmp_path.rglob("job.json")} == {"0_0", "1_0"}
+    for file in (city / "city.tiles").iterdir():
+        assert (tmp_path / "city" / "city.tiles" / file.name).read_bytes() == file.read_bytes()
+
+
+def test_without_ray_the_remedy_is_said_before_anything_runs(
+    scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    runs: InThisProcess,
+) -> None:
+    monkeypatch.setitem(extras.PACKAGES, "cluster", ("a_package_that_nobody_has",))
+    options = ["--tiles", "2x1", "--cluster", "local", *OPTIONS]
+    assert main(["train", str(scene), "-o", str(tmp_path / "out"), *options]) == 1
+    assert "pip install '.[cluster]'" in capsys.readouterr().err.replace("\n", " ")
+    assert not (tmp_path / "out").exists() and not runs.calls
 
 
 @pytest.mark.parametrize(
