@@ -39,7 +39,7 @@ from compgs.evaluation.camera_path import look_at
 from compgs.formats import open_scene, open_tiles
 from compgs.formats.tiled import read_manifest
 from compgs.formats.tiled_writer import NewTile, write_tiles
-from compgs.render import RasterSettings, local_camera, rasterize, render
+from compgs.render import RasterSettings, local_camera, rasterize, render, visible_mask
 from compgs.scene import load_scene
 from compgs.tiles import Plan, read_plan
 from compgs.tiles.ground import ground_of
@@ -154,8 +154,10 @@ def fly(folder: Path, memory: int | None, frames: int) -> dict[str, Any]:
     else:
         render(model, cameras[0])
     opening = time.process_time() - opening
-    digest, seconds, reads = hashlib.sha256(), [], []
+    digest, seconds, reads, in_view = hashlib.sha256(), [], [], []
     for camera in cameras:
+        groups = visible_mask(*model.bounds, local_camera(model, camera), RasterSettings())
+        in_view.append(len(model.tiles_of(groups)))
         read, start = model.cache.reads, time.process_time()
         image = render(model, camera).image
         seconds.append(time.process_time() - start)
@@ -172,6 +174,7 @@ def fly(folder: Path, memory: int | None, frames: int) -> dict[str, Any]:
         "median seconds": median(seconds),
         "worst seconds": max(seconds),
         "tiles opened a picture": sum(reads) / len(reads),
+        "tiles in view": [min(in_view), median(in_view), max(in_view)],
         "pictures": digest.hexdigest(),
     }
 
@@ -195,6 +198,7 @@ def city(options: argparse.Namespace) -> None:
     print(
         f"{first['tiles']} tiles, {first['anchors']:,} anchors, {first['coupled_primitives']:,} coupled primitives, "
         f"{whole / 1e6:.1f} MB; {options.frames} pictures of {SIZE[0]} x {SIZE[1]}; "
+        f"tiles in view: {' / '.join(f'{count:.0f}' for count in first['tiles in view'])} (least, median, most); "
         f"identical: {len({row['pictures'] for row in rows}) == 1}"
     )
     head = (

@@ -184,6 +184,19 @@ def test_one_tile_alone_is_the_tile_of_all(city: Path, tmp_path: Path) -> None:
     assert (tmp_path / "1_0" / "1_0.cgs").read_bytes() == (city / "city.tiles" / "1_0.cgs").read_bytes()
 
 
+def test_the_run_of_a_tile_is_encoded_without_its_margins(city: Path, tmp_path: Path) -> None:
+    assert main(["encode", str(city / "blocks" / "1_0"), "-o", str(tmp_path / "again.cgs")]) == 0
+    assert (tmp_path / "again.cgs").read_bytes() == (city / "city.tiles" / "1_0.cgs").read_bytes()
+
+
+def test_a_run_whose_settings_name_no_tiles_is_refused(city: Path, tmp_path: Path) -> None:
+    for name, value in (("tiles", 2), ("tile", "0_0"), ("tile", {"name": "0_0"})):
+        content = json.loads((city / "config.json").read_text())
+        (tmp_path / "config.json").write_text(json.dumps({**content, "tiles": None, name: value}))
+        (tmp_path / "checkpoint.safetensors").write_bytes(b"")
+        assert main(["train", "-o", str(tmp_path), "--resume"]) == 1
+
+
 def test_a_tile_that_fails_is_said_and_the_others_are_trained(
     scene: Path,
     tmp_path: Path,
@@ -312,7 +325,7 @@ def test_without_ray_the_remedy_is_said_before_anything_runs(
         (["--tiles", "2x1", "--cpus", "0"], "--cpus 0 --gpus 0: expected cores above 0"),
         (["--cluster", "local"], "--cluster: one training runs on one machine"),
         (["--tiles", "2x1", "--tile", "plan.json#0_0"], "give one"),
-        (["--tile", "plan.json#0_0"], "scene and settings are those of the run"),
+        (["--tile", "plan.json#0_0", "-r", "2"], "scene and settings are those of the run"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused_before_anything_is_made(

@@ -156,8 +156,8 @@ def load_settings(folder: Path) -> RunSettings:
             config=config_from_dict(content["settings"], str(path), METHODS[method].settings),
             method=method,
             splats=content.get("from_splats"),
-            tiles=content.get("tiles"),
-            tile=content.get("tile"),
+            tiles=_given(content, "tiles", str),
+            tile=_given(content, "tile", dict),
         )
     except FileNotFoundError as error:
         if (folder / CHECKPOINT_NAME).is_file():
@@ -221,6 +221,14 @@ def _as_typed(value: Any) -> str:
     if value is None:
         return "not given"
     return " ".join(f"{part:g}" for part in value) if isinstance(value, tuple) else str(value)
+
+
+def _given(content: dict[str, Any], name: str, kind: type) -> Any:
+    """None where there is none. Raises ValueError for another type."""
+    value = content.get(name)
+    if value is not None and not isinstance(value, kind):
+        raise ValueError(f"{name} is {value!r:.80}")
+    return value
 
 
 def _known_method(name: str) -> str:

@@ -1,10 +1,11 @@
 """`compgs train --tiles`: a capture in tiles, each a run of its own, and the scene that they make together."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from compgs.cli.command import ReadingOptions, check_lpips
 from compgs.cli.console import say, size
 from compgs.cli.progress import counting_runs
 from compgs.cli.run_folder import (
@@ -58,7 +59,8 @@ def check_options(command: "Train") -> None:
                 raise UsageError(f"{option} with {what}: {why}")
     if command.tile is not None and not command.resume:
         others = (command.scene, command.source, command.method, command.preset)
-        if command.assignments() or any(each is not None for each in others):
+        reading = any(getattr(command, f.name) != f.default for f in fields(ReadingOptions))
+        if reading or command.assignments() or any(each is not None for each in others):
             raise UsageError("--tile: scene and settings are those of the run with the plan; leave them out")
     if not (0 < command.cpus <= NEVER and 0 <= command.gpus <= NEVER):
         raise UsageError(
@@ -127,6 +129,8 @@ def train_tiles(command: "Train", settings: RunSettings) -> None:
     if command.cluster is not None:
         require("cluster", "--cluster")
     command.prepare_training("decode", "render")
+    if command.lpips:
+        check_lpips()
     path = Path(settings.scene.path).absolute()  # machines of a cluster start elsewhere
     settings = replace(settings, scene=replace(settings.scene, path=str(path)))
     scene, settings = command.read(settings)
