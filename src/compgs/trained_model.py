@@ -93,8 +93,8 @@ class TrainedModel(nn.Module):
 
     Embeddings are kept in units of their quantization step, so that a learning rate is a number of steps; log scales
     in natural units relative to the voxel size, because their steps are learned: in steps, all primitives would change
-    their size whenever a step does. All else (entropy models, files) sees latents in steps: `quantized` and `primitives`
-    are where log scales pass from one to the other.
+    their size whenever a step does. All else (entropy models, files) sees latents in steps: log scales pass from one to
+    the other in `quantized` and `primitives`.
     """
 
     coordinates: Tensor  # [N, 3] int32, voxels
