@@ -51,7 +51,7 @@ Its settings are then `--set coarse.levels=16`, and its tests: a file's bytes by
 a run that was stopped and continued (`tests/methods`).
 """
 
-from compgs.methods import hybrid, splats
+from compgs.methods import compact3d, hybrid, splats
 from compgs.methods.method import SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
 
@@ -62,6 +62,7 @@ METHODS: dict[str, Method] = {
         splats.PLAIN,
         splats.SPZ,
         splats.SOG,
+        compact3d.COMPACT3D,
     )
 }
 
