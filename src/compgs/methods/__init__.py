@@ -52,6 +52,7 @@ a run that was stopped and continued (`tests/methods`).
 """
 
 from compgs.methods import hybrid, splats
+from compgs.methods.compact_3dgs import COMPACT_3DGS
 from compgs.methods.eagles import EAGLES
 from compgs.methods.method import SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
@@ -64,6 +65,7 @@ METHODS: dict[str, Method] = {
         splats.SPZ,
         splats.SOG,
         EAGLES,
+        COMPACT_3DGS,
     )
 }
 
