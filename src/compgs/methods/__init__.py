@@ -51,7 +51,10 @@ Its settings are then `--set coarse.levels=16`, and its tests: a file's bytes by
 a run that was stopped and continued (`tests/methods`).
 """
 
-from compgs.methods import compact3d, hybrid, splats
+from compgs.methods import hybrid, splats
+from compgs.methods.compact3d import COMPACT3D
+from compgs.methods.compact_3dgs import COMPACT_3DGS
+from compgs.methods.eagles import EAGLES
 from compgs.methods.method import SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
 
@@ -62,7 +65,9 @@ METHODS: dict[str, Method] = {
         splats.PLAIN,
         splats.SPZ,
         splats.SOG,
-        compact3d.COMPACT3D,
+        COMPACT3D,
+        EAGLES,
+        COMPACT_3DGS,
     )
 }
 
