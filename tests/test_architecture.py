@@ -116,7 +116,11 @@ def test_imports_point_one_way(file: Path) -> None:
 
 # What trains, and what it alone needs. Everything else computes with numpy and numba.
 HEAVY = {"torch", "scipy", "safetensors"}
-TRAINS = {"tensors", "entropy", "losses", "stored_weights", "trained_model", "training", "codec.encoder"}
+TRAINS = {
+    "tensors", "entropy", "losses", "stored_weights", "trained_model", "training", "codec.encoder",
+    *(f"methods.anchors.{part}" for part in ("networks", "prediction", "model", "trainer")),
+    *(f"methods.cosa.{part}" for part in ("entropy", "model", "trainer", "writer")),
+}  # fmt: skip
 # Where one of HEAVY is loaded beside that, inside a function, for what cannot be done without it.
 LOADS = {
     "cli.command": "threads of a training",

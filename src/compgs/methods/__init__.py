@@ -50,7 +50,7 @@ Its settings are then `--set coarse.levels=16`, and its tests: a file's bytes by
 a run that was stopped and continued (`tests/methods`).
 """
 
-from compgs.methods import hybrid, splats
+from compgs.methods import cosa, hybrid, splats
 from compgs.methods.method import SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
 
@@ -61,6 +61,7 @@ METHODS: dict[str, Method] = {
         splats.PLAIN,
         splats.SPZ,
         splats.SOG,
+        cosa.COSA,
     )
 }
 
