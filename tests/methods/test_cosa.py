@@ -54,7 +54,7 @@ def test_the_suffix_is_the_containers() -> None:
     assert METHODS["cosa-gs"].suffix == packed.SUFFIX
 
 
-# the file --------------------------------------------------------------------------------------------------------------
+# the file ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_file_holds_the_symbols_that_were_written_and_shows_what_was_trained(
@@ -126,7 +126,7 @@ def test_coordinates_are_inputs_between_minus_one_and_one() -> None:
     assert inputs[3].tolist() == [3584, -3584, -3584]  # what left the cube stays at its side
 
 
-# training --------------------------------------------------------------------------------------------------------------
+# training ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_first_phase_has_no_rate_and_grows(blob_scene: Scene) -> None:
@@ -182,7 +182,7 @@ def test_lambda_weighs_megabytes_of_the_whole_scene(blob_scene: Scene) -> None:
     trainer.values()
     chained, masks = trainer.chained, trainer.masks
     assert chained is not None and masks is not None
-    bits = float(trainer.model.total_bits(chained.bits, masks))
+    bits = trainer.model.total_bits(chained.bits, masks).item()
     added = trainer.added()
     assert added is not None and float(added) == pytest.approx(3.0 * bits / BITS_PER_MEGABYTE)
     added.backward()
@@ -235,7 +235,7 @@ def test_what_has_diverged_is_not_written(blob_scene: Scene, tmp_path: Path) -> 
     assert not (tmp_path / "a").exists()
 
 
-# damaged files -----------------------------------------------------------------------------------------------------------
+# damaged files ------------------------------------------------------------------------------------------------------
 
 
 def with_array(content: packed.Packed, name: str, data: bytes) -> packed.Packed:
