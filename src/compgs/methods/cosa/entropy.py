@@ -107,6 +107,7 @@ class CausalChain(nn.Module):
         *,
         noise: Noise | None,  # None: symbols
         network_bits: int | None,  # None: weights as they are
+        everywhere: bool = True,  # noise also in the values; else in the bits alone, and the values are symbols
         rate: bool = True,
     ) -> Chained:
         """Numbers with noise or rounded, and their bits if `rate`."""
@@ -120,11 +121,11 @@ class CausalChain(nn.Module):
 
         def code(name: str, y: Tensor, x: Tensor, slots: int = 1) -> tuple[Tensor, Tensor]:
             mean, scale = self._means_and_scales(name, x, network_bits)
-            if noise is not None:
-                y_hat = y + noise(y)
-                distance = y_hat - mean
-            else:
+            if noise is None:
                 y_hat, distance = quantize(y, mean), round_straight_through(y - mean)
+            else:
+                noisy = y + noise(y)
+                y_hat, distance = noisy if everywhere else quantize(y, mean), noisy - mean
             if not rate:
                 return y_hat, y.new_empty(0)
             rows = len(y) * slots

@@ -95,8 +95,15 @@ class CosaModel(AnchorModel):
 
     def chained(self, noise: Noise | None, *, rate: bool = True) -> Chained:
         """All anchors along the chain; without `noise`, as the decoder will have them."""
-        bits = self.config.cosa.network_bits
-        return self.chain(self.places(), self.natural(), noise=noise, network_bits=bits, rate=rate)
+        c = self.config.cosa
+        return self.chain(
+            self.places(),
+            self.natural(),
+            noise=noise,
+            network_bits=c.network_bits,
+            everywhere=c.noise_everywhere,
+            rate=rate,
+        )
 
     def kept(self) -> Tensor:
         """[N, K] bool: coupled primitives that the masks leave."""

@@ -29,6 +29,8 @@ class CosaSection:
     rate_start: Share = 1 / 3
     # of the steps: symbols in place of noise from then on (COSA-GS: never)
     symbols_start: Share = 1.0
+    # True: rendering and contexts see noise, too (COSA-GS); else symbols, and only the likelihood sees noise
+    noise_everywhere: bool = True
     # initial learned steps: of the latent, of features, of offsets (position scales), of log scales
     latent_step: Step = 1.0
     feature_step: Step = 0.33
