@@ -54,6 +54,7 @@ a run that was stopped and continued (`tests/methods`).
 from compgs.methods import hybrid, splats
 from compgs.methods.compact3d import COMPACT3D
 from compgs.methods.compact_3dgs import COMPACT_3DGS
+from compgs.methods.cosa import COSA
 from compgs.methods.eagles import EAGLES
 from compgs.methods.method import SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
@@ -68,6 +69,7 @@ METHODS: dict[str, Method] = {
         COMPACT3D,
         EAGLES,
         COMPACT_3DGS,
+        COSA,
     )
 }
 
