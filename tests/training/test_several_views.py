@@ -99,7 +99,9 @@ def test_latents_are_quantized_and_their_bits_counted_once_for_all_views(
     assert asked == [sorted(expected)]
 
 
-def test_growth_gathers_what_each_view_alone_would_have_shown(blob_scene: Scene, tiny_config: Config) -> None:
+def test_growth_gathers_what_each_view_alone_would_have_shown(
+    blob_scene: Scene, tiny_config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Gradients are those of a view's own loss, not of a mean over the step's: thresholds mean what they meant."""
     control = replace(tiny_config.control, start=0.9, stop=1.0, every=0.9)
     config = with_training(replace(tiny_config, control=control), **CERTAIN)
