@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from compgs.cli.command import ReadingOptions, check_lpips
 from compgs.cli.console import say, size
 from compgs.cli.progress import counting_runs
+from compgs.cli.ranks import several
 from compgs.cli.run_folder import (
     SETTINGS_NAME,
     TRAINING_NAME,
@@ -43,6 +44,10 @@ def check_options(command: "Train") -> None:
             parse_grid(command.tiles)
         if command.method not in (None, ALONE):
             raise UsageError(f"--tiles: tiles are .cgs files, which --method {command.method} does not write")
+    if in_tiles and several():
+        raise UsageError(
+            "--tiles: torchrun's processes share one training; start it without, or with --cluster"
+        )
     if in_tiles or command.tile is not None:
         what = "--tiles" if in_tiles else "--tile"
         for option, given, why in (
