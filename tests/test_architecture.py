@@ -119,6 +119,7 @@ HEAVY = {"torch", "scipy", "safetensors"}
 TRAINS = {"tensors", "entropy", "losses", "stored_weights", "trained_model", "training", "codec.encoder"} | {
     f"methods.parts.{name}" for name in ("vector_quantization", "fake_quantization", "significance")
 }
+TRAINS |= {"methods.c3dgs.sensitivity", "methods.c3dgs.shapes"}
 HOOKS = "hooks"  # what a method's hooks are called, in `methods`: they train, too
 # Where one of HEAVY is loaded beside that, inside a function, for what cannot be done without it.
 LOADS = {
