@@ -51,7 +51,7 @@ Its settings are then `--set coarse.levels=16`, and its tests: a file's bytes by
 a run that was stopped and continued (`tests/methods`).
 """
 
-from compgs.methods import c3dgs, compact3d, hybrid, splats
+from compgs.methods import c3dgs, compact3d, hybrid, lightgaussian, splats
 from compgs.methods.method import SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
 
@@ -64,6 +64,7 @@ METHODS: dict[str, Method] = {
         splats.SOG,
         compact3d.COMPACT3D,
         c3dgs.C3DGS,
+        lightgaussian.LIGHTGAUSSIAN,
     )
 }
 

@@ -207,10 +207,14 @@ class SplatTrainer:
         loss.backward()
 
     def update(self) -> None:
-        set_learning_rates(self.optimizer, self.progress, exponential_decay)
+        set_learning_rates(self.optimizer, self.progress, self.learning_rate)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.views.learn(self.progress)
+
+    def learning_rate(self, first: float, last: float, progress: float) -> float:
+        """Of a group, at some progress of the phase."""
+        return exponential_decay(first, last * self.hooks.slowing, progress)
 
     def observe(self, rendered: RasterResult, camera: Camera) -> None:
         if self.schedule.active(self.step) and rendered.means2d.grad is not None:
