@@ -51,7 +51,13 @@ Its settings are then `--set coarse.levels=16`, and its tests: a file's bytes by
 a run that was stopped and continued (`tests/methods`).
 """
 
-from compgs.methods import c3dgs, compact3d, hybrid, lightgaussian, splats
+from compgs.methods import hybrid, splats
+from compgs.methods.c3dgs import C3DGS
+from compgs.methods.compact3d import COMPACT3D
+from compgs.methods.compact_3dgs import COMPACT_3DGS
+from compgs.methods.cosa import COSA
+from compgs.methods.eagles import EAGLES
+from compgs.methods.lightgaussian import LIGHTGAUSSIAN
 from compgs.methods.method import SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
 
@@ -62,9 +68,12 @@ METHODS: dict[str, Method] = {
         splats.PLAIN,
         splats.SPZ,
         splats.SOG,
-        compact3d.COMPACT3D,
-        c3dgs.C3DGS,
-        lightgaussian.LIGHTGAUSSIAN,
+        COMPACT3D,
+        C3DGS,
+        LIGHTGAUSSIAN,
+        EAGLES,
+        COMPACT_3DGS,
+        COSA,
     )
 }
 
