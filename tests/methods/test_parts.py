@@ -10,7 +10,7 @@ import torch
 from compgs.errors import SplatFileError
 from compgs.formats.packed import Packed
 from compgs.methods.parts.books import entries_within
-from compgs.methods.parts.content import stored_offset
+from compgs.methods.parts.content import stored_place
 from compgs.methods.parts.fake_quantization import fake_half, fake_levels, straight_through
 from compgs.methods.parts.indices import (
     index_bits,
@@ -233,8 +233,8 @@ def test_sorted_labels_are_counts() -> None:
 def test_an_offset_that_is_none_is_refused(value: object) -> None:
     facts = {} if value is None else {"offset": value}
     with pytest.raises(SplatFileError, match="offset: expected three numbers"):
-        stored_offset(Packed("toy", facts, {}))  # type: ignore[arg-type]
-    assert stored_offset(Packed("toy", {"offset": [1, 2.5, -3e6]}, {})) == (1.0, 2.5, -3e6)
+        stored_place(Packed("toy", facts, {}))  # type: ignore[arg-type]
+    assert stored_place(Packed("toy", {"offset": [1, 2.5, -3e6]}, {})) == (1.0, 2.5, -3e6)
 
 
 def test_codebooks_are_halved_until_they_take_no_more_than_their_share() -> None:

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from compgs.errors import SplatFileError
 from compgs.formats.arrays import (
@@ -160,8 +161,6 @@ def _image(values: np.ndarray, effort: int = USUAL) -> bytes:
 
 def _webp(pixels: np.ndarray, effort: int = USUAL) -> bytes:
     """Lossless, and exact: colors of transparent pixels are kept, too."""
-    from PIL import Image  # here: whoever only asks which formats there are needs no images
-
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "WEBP", lossless=True, exact=True, quality=effort, method=6)
     return buffer.getvalue()
@@ -341,8 +340,6 @@ def _pixels(files: SogFiles, name: str, index: int, channels: int) -> np.ndarray
 
 def _decoded(files: SogFiles, name: str, index: int, channels: int, most_pixels: int) -> np.ndarray:
     """[H, W, channels] uint8; the size is looked at before the pixels are decoded."""
-    from PIL import Image
-
     file_name = _names(files, name)[index]
     place = f"{files.place}: {file_name}"
     try:

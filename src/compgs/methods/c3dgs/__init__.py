@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from compgs.config import Config, Range
-from compgs.formats.packed import SUFFIX
-from compgs.methods.method import SPLAT_SETTINGS, Method
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -89,7 +88,7 @@ C3DGS = Method(
     name=NAME,
     description="plain 3DGS, codebooks by sensitivity, trained for 8 bits",
     reference="Niedermayr et al., Compressed 3D Gaussian Splatting for Accelerated Novel View Synthesis, CVPR 2024",
-    suffix=SUFFIX,
+    suffix=PACKED_SUFFIX,
     uses=(*SPLAT_SETTINGS, NAME),
     train=train,
     write=write,

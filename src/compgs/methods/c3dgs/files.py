@@ -22,7 +22,7 @@ from compgs.formats.arrays import SplatArrays, harmonics_above_dc, logit
 from compgs.formats.packed import Packed
 from compgs.formats.sog import morton_order
 from compgs.methods.c3dgs import NAME
-from compgs.methods.parts.content import Offset, stored_offset, stored_place
+from compgs.methods.parts.content import Offset, stored_place
 from compgs.methods.parts.indices import checked_labels
 from compgs.methods.parts.levels import Levels, stored_levels
 
@@ -97,7 +97,7 @@ def splats_of(packed: Packed) -> SplatArrays:
         logit(stored_levels(packed, "opacities", (count,))),
         dc[colors],
         rest[colors],
-        stored_offset(packed),
+        stored_place(packed),
     )
 
 

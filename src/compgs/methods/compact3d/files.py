@@ -20,7 +20,7 @@ import numpy as np
 from compgs.formats.arrays import SplatArrays, harmonics_above_dc
 from compgs.formats.packed import Packed
 from compgs.methods.compact3d import NAME
-from compgs.methods.parts.content import stored_offset
+from compgs.methods.parts.content import stored_place
 from compgs.methods.parts.indices import (
     index_bits,
     label_counts,
@@ -98,7 +98,7 @@ def splats_of(packed: Packed) -> SplatArrays:
         logits,
         values["dc"],
         values["rest"].reshape(count, -1, 3),
-        stored_offset(packed),
+        stored_place(packed),
     )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from compgs.formats.arrays import SplatArrays, harmonics_above_dc, normalized
 from compgs.formats.packed import Packed, packed_bits, unpacked_bits
 from compgs.methods.lightgaussian import NAME
-from compgs.methods.parts.content import stored_offset
+from compgs.methods.parts.content import stored_place
 from compgs.methods.parts.indices import index_bits, packed_indices, stored_indices
 
 GEOMETRY_BYTES = 12 + 6 + 8 + 2
@@ -65,7 +65,7 @@ def splats_of(packed: Packed) -> SplatArrays:
         packed.array("opacity_logits", np.float16, (count,)).astype(np.float32),
         colors[:, :3],
         colors[:, 3:].reshape(count, -1, 3),
-        stored_offset(packed),
+        stored_place(packed),
     )
 
 

@@ -34,13 +34,8 @@ class Content:
         return write_packed(path, self.packed, self.codecs)
 
 
-def stored_offset(packed: Packed) -> Offset:
-    """From where positions count, world units: the fact `offset`. Raises SplatFileError."""
-    return stored_place(packed, "offset")
-
-
-def stored_place(packed: Packed, name: str) -> Offset:
-    """A place among the facts. Raises SplatFileError unless it is three finite numbers."""
+def stored_place(packed: Packed, name: str = "offset") -> Offset:
+    """A place among the facts; `offset` is what positions count from. Raises SplatFileError."""
     value = packed.facts.get(name)
     numbers = value if isinstance(value, list) and len(value) == 3 else []
     if not numbers or not all(type(n) in (int, float) and abs(n) < float("inf") for n in numbers):
