@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 SPLAT_SETTINGS = (
     "splats",
     "training.steps",
+    "training.views_per_step",
     "training.seed",
     "training.ssim_weight",
     "training.exposure",
