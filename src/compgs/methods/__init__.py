@@ -44,7 +44,7 @@ with three bits of color and stores them so:
         ...
         return splat_model(packed, SplatArrays(...), device, background)
 
-    METHOD = Method("coarse", "Plain 3DGS with few colors", "nobody, 2026", SUFFIX,
+    METHOD = Method("coarse", "Plain 3DGS with few colors", "nobody, 2026", PACKED_SUFFIX,
                     (*SPLAT_SETTINGS, "coarse"), train, write, open_file, CoarseConfig, from_splats=True)
 
 Its settings are then `--set coarse.levels=16`, and its tests: a file's bytes by the method's byte law, the round trip,
@@ -56,7 +56,7 @@ from compgs.methods.compact3d import COMPACT3D
 from compgs.methods.compact_3dgs import COMPACT_3DGS
 from compgs.methods.cosa import COSA
 from compgs.methods.eagles import EAGLES
-from compgs.methods.method import SPLAT_SETTINGS, Method
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
 
 METHODS: dict[str, Method] = {
@@ -73,4 +73,4 @@ METHODS: dict[str, Method] = {
     )
 }
 
-__all__ = ["METHODS", "SPLAT_SETTINGS", "Method", "settings_of", "train", "write"]
+__all__ = ["METHODS", "PACKED_SUFFIX", "SPLAT_SETTINGS", "Method", "settings_of", "train", "write"]

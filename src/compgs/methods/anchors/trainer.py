@@ -217,8 +217,7 @@ class AnchorTrainer:
     # checkpoints ---------------------------------------------------------------------------------------------------
 
     def save(self, path: Path | None) -> None:
-        if path is None:
-            return
+        assert path is not None, "it trains in one process"
         tensors = {f"model/{name}": value for name, value in self.model.state_dict().items()}
         moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
         tensors |= {f"optimizer/{name}": value for name, value in moments.items()}

@@ -25,7 +25,7 @@ from compgs.gaussians import Gaussians
 from compgs.methods.compact_3dgs import MOST_CELLS, MOST_FEATURES, MOST_LEVELS, MOST_TABLE_BITS
 from compgs.methods.compact_3dgs.color_network import ColorNetwork, network_shapes
 from compgs.methods.compact_3dgs.hash_grid import GridLayout
-from compgs.methods.parts.content import Content, Offset, stored_offset
+from compgs.methods.parts.content import Content, Offset, stored_place
 from compgs.methods.parts.indices import packed_indices, stored_indices
 from compgs.model.splats import SplatArrays, SplatModel
 
@@ -141,7 +141,7 @@ def opened(packed: Packed, device: "Device", background: tuple[float, float, flo
             packed.array("opacities", np.float16, (count,)).astype(np.float32),
             np.zeros((count, 3), np.float32),
             np.zeros((count, 0, 3), np.float32),
-            stored_offset(packed),
+            stored_place(packed),
         )
     return NetworkColored(SplatModel(checked(packed.path, arrays), background), network)
 
