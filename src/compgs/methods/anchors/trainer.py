@@ -1,6 +1,7 @@
 """Training of such anchors without rate; methods add theirs (`training/loop.py` has the loop)."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ from compgs.training.views_in_turn import ViewsInTurn
 
 
 class AnchorTrainer:
-    """State of a run: model, optimizer, control, and the order in which views come.
+    """State of a run: model, optimizer, control, and the order in which views come, one a step.
 
         values ──predict──► Gaussians ──rasterize──► image ──compare, + added──► loss ──► step ──► finish_step
 
@@ -117,14 +118,11 @@ class AnchorTrainer:
         if len(rows) == 0:
             return self.skip(photograph)
         prediction = self.predict(values.rows(rows), camera)
-        rendered = rasterize_step(
-            prediction.gaussians, camera, self.settings, watched=self.schedule.active(self.step)
-        )
-        loss = photometric_loss(rendered.image, photograph, self.config.training.ssim_weight)
-        loss = loss + self.regularize(prediction, prediction.gaussians, camera)
+        rendered = self.rasterize(prediction.gaussians, camera)
+        loss = self.compare(rendered, photograph) + self.regularize(prediction, camera)
         added = self.added()
         loss = loss if added is None else loss + added
-        loss.backward()
+        self.backward(loss, rendered, prediction.gaussians)
         self.update(index)
         self.observe(rows, prediction, rendered, camera)
         self.finish_step()
@@ -151,8 +149,15 @@ class AnchorTrainer:
     def predict(self, values: AnchorValues, camera: Camera) -> Prediction:
         return predict_anchors(self.weights(), values, camera_center(camera, self.device), self.model.frame)
 
-    def regularize(self, prediction: Prediction, gaussians: Gaussians, camera: Camera) -> Tensor:
+    def rasterize(self, gaussians: Gaussians, camera: Camera) -> RasterResult:
+        return rasterize_step(gaussians, camera, self.settings, watched=self.schedule.active(self.step))
+
+    def compare(self, rendered: RasterResult, target: Target) -> Tensor:
+        return photometric_loss(rendered.image, target, self.config.training.ssim_weight)
+
+    def regularize(self, prediction: Prediction, camera: Camera) -> Tensor:
         """Penalties on large primitives and on a vanishing scene."""
+        gaussians = prediction.gaussians
         unit = scale_unit(gaussians.means, camera_center(camera, self.device), self.scene.extent)
         volumes = scale_regularizer(gaussians.scales / unit, prediction.drawn)
         return self.config.training.scale_weight * volumes + self.vanishing(prediction)
@@ -161,12 +166,17 @@ class AnchorTrainer:
         """Keeps a scene of which hardly anything is drawn from vanishing."""
         return vanishing_loss(prediction)
 
+    def backward(self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians) -> None:
+        """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
+        loss.backward()
+
     def update(self, view: int) -> None:
         t = self.config.training
+        exposures = self.views.exposure_gradients([view])
         set_learning_rates(self.optimizer, self.progress, DECAYS[t.schedule], t.head_warm_up)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        self.views.learn(self.progress, [view], self.views.exposure_gradients([view]))
+        self.views.learn(self.progress, [view], exposures)
 
     def observe(self, rows: Tensor, prediction: Prediction, rendered: RasterResult, camera: Camera) -> None:
         """The statistics that growth and pruning go by."""
@@ -282,5 +292,32 @@ def train_anchors(kind: type[AnchorTrainer], scene: Scene, config: Config, run: 
         trainer = kind.resumed(scene, run.earlier, config, run.device, run.method)
     else:
         trainer = kind(scene, config, run.device, run.method)
+    if run.profile is not None:
+        run.profile.watch(trainer, PARTS, stations)
     trainer.run(run)
     return trainer.model
+
+
+# What a profile calls the parts of a step.
+PARTS = {
+    "values": "quantization and entropy",
+    "visible_anchors": "culling",
+    "predict": "prediction",
+    "rasterize": "projection and rasterization",
+    "compare": "loss",
+    "regularize": "loss",
+    "added": "quantization and entropy",
+    "backward": "prediction and entropy, backward",
+    "update": "optimizer",
+    "observe": "control",
+    "finish_step": "control",
+}
+
+
+def stations(
+    loss: Tensor, rendered: RasterResult, gaussians: Gaussians
+) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
+    """Where the gradients of a step arrive, part by part."""
+    yield "loss, backward", (rendered.image,)
+    yield "rasterization, backward", (rendered.means2d,)
+    yield "projection, backward", (gaussians.means, gaussians.quaternions, gaussians.scales)
