@@ -212,8 +212,9 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class SplatConfig:
-    """Plain 3D Gaussian Splatting (`--method 3dgs`; Kerbl et al. 2023), as published; schedules as fractions of its
-    30 000 steps, with floors for short runs (`training/densification.py`).
+    """Plain 3D Gaussian Splatting (`--method 3dgs`; Kerbl et al. 2023), as published.
+
+    Schedules are fractions of its 30 000 steps, with floors for short runs (`training/densification.py`).
     """
 
     # degree of the spherical harmonics at the end

@@ -169,7 +169,7 @@ def test_damaged_content_of_a_method_is_named(blob_scene: Scene, tmp_path: Path)
     with pytest.raises(SplatFileError, match=r"a\.packed: means: expected float32 of shape \(any, 3\)"):
         open_scene(path)
     write_packed(path, Packed("compgs", {}, {}))
-    with pytest.raises(SplatFileError, match="a file of method compgs; known here are those of toy"):
+    with pytest.raises(SplatFileError, match=r"a file of method compgs; known here are those of .*toy"):
         open_scene(path)
 
 

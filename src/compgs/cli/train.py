@@ -59,8 +59,8 @@ NOTABLE_MISS = 0.05  # of the size that was asked for
 class Train(ComputingCommand, SceneOptions):
     """Train a scene, write its file, decode the file and compare it with the held-out views.
 
-    The file is a .cgs. With --method the scene is trained by another method, and the file is that method's: of 3dgs,
-    plain 3D Gaussian Splatting without any compression, a .ply: what compression is to be compared with.
+    The file is a .cgs. With --method the scene is trained by another method, and the file is that method's: with 3dgs
+    a .ply of plain, uncompressed 3D Gaussian Splatting, which compression is compared with.
 
     The run's folder then holds the file, results.json, per_view.json, config.json, the renders beside the
     photographs (test/renders, test/gt, contact_sheet.png) and a checkpoint.

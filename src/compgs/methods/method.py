@@ -25,6 +25,8 @@ SPLAT_SETTINGS = (
     "training.exposure",
     "training.checkpoint_minutes",
 )
+# Of files in the shared container: `compgs.formats.packed.SUFFIX`, without loading the formats.
+PACKED_SUFFIX = ".packed"
 Presets = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 
