@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from compgs.config import Config, ModelConfig, TrainingConfig
+from compgs.errors import ConfigError
 from compgs.methods.anchors.model import AnchorModel, initial_anchors
 from compgs.methods.anchors.prediction import predict_anchors
 from compgs.methods.anchors.scene import network_shapes
@@ -121,3 +122,11 @@ def test_plain_anchors_learn_and_grow(blob_scene: Scene, config: Config) -> None
     assert trainer.model.anchors > before
     assert np.mean(losses[-3:]) < 0.5 * np.mean(losses[:2])
     assert trainer.estimated_bytes() == 4 * sum(p.numel() for p in trainer.model.parameters())
+
+
+def test_several_views_a_step_are_refused(blob_scene: Scene, config: Config) -> None:
+    several = replace(config, training=replace(config.training, views_per_step=2))
+    with pytest.raises(
+        ConfigError, match="method anchors trains in one process, with one view a step; found 1 and 2"
+    ):
+        AnchorTrainer(blob_scene, several, torch.device("cpu"), "anchors")

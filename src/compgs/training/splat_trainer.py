@@ -250,7 +250,8 @@ class SplatTrainer:
 
     def check_ranks(self) -> None:
         """Raises TrainingError if the ranks of a torchrun have come to hold different splats."""
-        check_identical(self.step, self.named_parameters())
+        own = {HOOKS + name: value for name, value in hook_state(self.hooks).items()}
+        check_identical(self.step, {**self.named_parameters(), **own})
 
     @torch.no_grad()
     def as_drawn(self) -> Splats:
