@@ -113,6 +113,10 @@ def export(
         raise ConfigError(
             f"{source}: tiles are exported one by one, as {tile}: together they may not fit in memory"
         )
+    if not isinstance(model, HybridModel | SplatModel):
+        raise ConfigError(
+            f"{source}: a scene of another method, whose networks cannot be exported; expected a .cgs file or splats"
+        )
     cameras = own_cameras(model)
     fitted = [smaller(c) for c in (*cameras, *between(cameras, max(0, FITTED_CAMERAS - len(cameras))))]
     compared = (*cameras, *between(cameras, COMPARED_CAMERAS, seed=1))
