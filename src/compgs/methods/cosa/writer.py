@@ -20,7 +20,7 @@ from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import NotEncodable
 from compgs.formats.packed import Packed, write_packed
-from compgs.methods.cosa.chain import walk
+from compgs.methods.cosa.chain import coordinate_inputs, walk
 from compgs.methods.cosa.content import CosaContent
 from compgs.methods.cosa.entropy import ContextNetwork
 from compgs.methods.cosa.model import CosaModel
@@ -47,29 +47,22 @@ def content_of(model: CosaModel) -> CosaContent:
     y = {g: v.detach().cpu().double().numpy()[rows] / steps[g] for g, v in model.natural().items()}
     y["offset"] = y["offset"].reshape(*mask.shape, 3)[mask]
     coded = _Rounding(y)
-    x, y_, z = (int(v) for v in model.origin)
-    content = CosaContent(
-        model.chain.shape,
-        model.frame,
-        steps,
-        (x, y_, z),
-        int(model.depth),
-        coordinates,
-        mask,
-        networks,
-        {},
-        (),
-        (),
-        {name: quantized_tensor(w, model.weight_bits(w)) for name, w in model.networks.weights().items()},
-    )
-    latents = walk(content.shape, networks, content.places, mask, coded)
+    places = coordinate_inputs(coordinates, model.origin.cpu().numpy(), int(model.depth))
+    latents = walk(model.chain.shape, networks, places, mask, coded)
+    corner_x, corner_y, corner_z = (int(v) for v in model.origin)
     return CosaContent(
-        **{
-            **vars(content),
-            "latents": latents,
-            "symbols": tuple(coded.symbols),
-            "tables": tuple(coded.tables),
-        }
+        shape=model.chain.shape,
+        frame=model.frame,
+        steps=steps,
+        origin=(corner_x, corner_y, corner_z),
+        depth=int(model.depth),
+        coordinates=coordinates,
+        mask=mask,
+        networks=networks,
+        latents=latents,
+        symbols=tuple(coded.symbols),
+        tables=tuple(coded.tables),
+        weights={n: quantized_tensor(w, model.weight_bits(w)) for n, w in model.networks.weights().items()},
     )
 
 
