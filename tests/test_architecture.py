@@ -78,9 +78,10 @@ ALLOWED = {
         "methods",
     },
     "suites": BASE | {"evaluation", "methods", "metrics"},
+    "tiles": BASE | {"scene", "formats", "suites"},
     "cli": BASE
     | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "compressing", "viewer", "methods", "reconstruct", "suites"},
+    | {"trained_model", "exporting", "compressing", "viewer", "methods", "reconstruct", "suites", "tiles"},
     "__main__": BASE | {"cli"},
 }
 
