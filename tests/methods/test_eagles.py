@@ -21,7 +21,7 @@ from compgs.render import render
 from compgs.scene.views import Scene
 from compgs.training import SplatTrainer
 
-from .quick import check_continues_exactly, quick
+from .quick import quick
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +85,8 @@ def test_the_file_holds_what_was_drawn(blob_scene: Scene) -> None:
     assert drawn.rest.abs().max() > 1e-3
 
 
-@pytest.mark.parametrize("stop", [10, 20])
-def test_a_run_that_was_stopped_continues_exactly(stop: int, blob_scene: Scene, tmp_path: Path) -> None:
-    check_continues_exactly("eagles", quick("eagles"), blob_scene, stop, tmp_path)
+def test_a_run_that_was_stopped_continues_exactly(check_continues: Any) -> None:
+    check_continues("eagles", quick("eagles"), (10, 20))
 
 
 def test_splats_without_harmonics_have_no_latents_of_them(blob_scene: Scene, tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ import torch
 
 from compgs.errors import SplatFileError
 from compgs.formats.packed import Packed
-from compgs.methods.parts.content import stored_offset
+from compgs.methods.parts.books import entries_within
+from compgs.methods.parts.content import stored_place
 from compgs.methods.parts.fake_quantization import fake_half, fake_levels, straight_through
 from compgs.methods.parts.indices import (
     index_bits,
@@ -232,5 +233,13 @@ def test_sorted_labels_are_counts() -> None:
 def test_an_offset_that_is_none_is_refused(value: object) -> None:
     facts = {} if value is None else {"offset": value}
     with pytest.raises(SplatFileError, match="offset: expected three numbers"):
-        stored_offset(Packed("toy", facts, {}))  # type: ignore[arg-type]
-    assert stored_offset(Packed("toy", {"offset": [1, 2.5, -3e6]}, {})) == (1.0, 2.5, -3e6)
+        stored_place(Packed("toy", facts, {}))  # type: ignore[arg-type]
+    assert stored_place(Packed("toy", {"offset": [1, 2.5, -3e6]}, {})) == (1.0, 2.5, -3e6)
+
+
+def test_codebooks_are_halved_until_they_take_no_more_than_their_share() -> None:
+    assert entries_within(4096, 1.0, lambda k: 40.0 * k, 1.0) == 4096
+    for share in (0.05, 0.1, 0.5):
+        entries = entries_within(4096, 200_000, lambda k: 40.0 * k, share)
+        assert 40 * entries / (200_000 + 40 * entries) <= share < 80 * entries / (200_000 + 80 * entries)
+    assert entries_within(4096, 1.0, lambda k: 40.0 * k, 0.1) == 1

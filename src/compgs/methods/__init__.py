@@ -51,9 +51,7 @@ Its settings are then `--set coarse.levels=16`, and its tests: a file's bytes by
 a run that was stopped and continued (`tests/methods`).
 """
 
-from compgs.methods import hybrid, splats
-from compgs.methods.compact_3dgs import COMPACT_3DGS
-from compgs.methods.eagles import EAGLES
+from compgs.methods import compact3d, compact_3dgs, eagles, hybrid, splats
 from compgs.methods.method import SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
 
@@ -64,8 +62,9 @@ METHODS: dict[str, Method] = {
         splats.PLAIN,
         splats.SPZ,
         splats.SOG,
-        EAGLES,
-        COMPACT_3DGS,
+        compact3d.COMPACT3D,
+        eagles.EAGLES,
+        compact_3dgs.COMPACT_3DGS,
     )
 }
 

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from compgs.scene.views import Scene
     from compgs.training.loop import Run
 
+# As in `compgs.formats.packed`, which would load numpy and more with the command line's help.
+SUFFIX = ".packed"
 # Settings of plain 3DGS, which methods that build on it have, too.
 SPLAT_SETTINGS = (
     "splats",

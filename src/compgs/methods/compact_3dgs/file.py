@@ -10,7 +10,6 @@
 """
 
 import functools
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -25,7 +24,7 @@ from compgs.gaussians import Gaussians
 from compgs.methods.compact_3dgs import MOST_CELLS, MOST_FEATURES, MOST_LEVELS, MOST_TABLE_BITS
 from compgs.methods.compact_3dgs.color_network import ColorNetwork, network_shapes
 from compgs.methods.compact_3dgs.hash_grid import GridLayout
-from compgs.methods.parts.content import Content, Offset, stored_offset
+from compgs.methods.parts.content import Content, Offset, stored_place
 from compgs.methods.parts.indices import packed_indices, stored_indices
 from compgs.model.splats import SplatArrays, SplatModel
 
@@ -141,7 +140,7 @@ def opened(packed: Packed, device: "Device", background: tuple[float, float, flo
             packed.array("opacities", np.float16, (count,)).astype(np.float32),
             np.zeros((count, 3), np.float32),
             np.zeros((count, 0, 3), np.float32),
-            stored_offset(packed),
+            stored_place(packed),
         )
     return NetworkColored(SplatModel(checked(packed.path, arrays), background), network)
 
@@ -167,7 +166,7 @@ def _network(packed: Packed) -> ColorNetwork:
     shapes = network_shapes(layout.width)
     weights = [_finite(packed, f"weights.{i}", np.float16, shape) for i, shape in enumerate(shapes)]
     grid = _finite(packed, "grid", np.float16, (layout.total, layout.features))
-    middle = np.array(_place(packed, "middle"), np.float32)
+    middle = np.array(stored_place(packed, "middle"), np.float32)
     return ColorNetwork(layout, grid, tuple(weights), middle, unit)
 
 
@@ -187,16 +186,6 @@ def _finite(packed: Packed, name: str, kind: type[np.generic], shape: tuple[int 
     if not np.isfinite(array).all():
         raise SplatFileError(f"{packed.path}: {name}: hold what is not a finite number; copy it again")
     return array
-
-
-def _place(packed: Packed, name: str) -> tuple[float, float, float]:
-    """Raises SplatFileError."""
-    found = packed.facts.get(name)
-    numbers = found if isinstance(found, list) and len(found) == 3 else []
-    if not numbers or not all(type(n) in (int, float) and math.isfinite(n) for n in numbers):
-        raise SplatFileError(f"{packed.path}: {name}: expected three numbers, found {found!r:.60}")
-    x, y, z = map(float, numbers)
-    return x, y, z
 
 
 def _half(values: np.ndarray) -> np.ndarray:

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from compgs.config import Config, LearningRate, Positive, Range, Share, SplatConfig
-from compgs.formats.packed import SUFFIX, Packed
-from compgs.methods.method import SPLAT_SETTINGS, Method
+from compgs.methods.method import SPLAT_SETTINGS, SUFFIX, Method
 
 if TYPE_CHECKING:
     from compgs.devices import Device
+    from compgs.formats.packed import Packed
     from compgs.methods.parts.content import Content
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
@@ -88,7 +88,7 @@ def write(model: "Content", path: Path, config: EaglesConfig) -> int:
     return model.write(path)
 
 
-def open_file(packed: Packed, device: "Device", background: tuple[float, float, float]) -> "SplatModel":
+def open_file(packed: "Packed", device: "Device", background: tuple[float, float, float]) -> "SplatModel":
     from compgs.methods.eagles.file import opened
 
     return opened(packed, device, background)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compgs.formats.packed import Packed, splat_model
-from compgs.methods.parts.content import Content, Offset, stored_offset
+from compgs.methods.parts.content import Content, Offset, stored_place
 from compgs.methods.parts.histogram import packed_symbols, unpacked_symbols
 from compgs.model.degrees import MAX_DEGREE, harmonics_above_dc
 from compgs.model.splats import SplatArrays, SplatModel
@@ -95,7 +95,7 @@ def opened(packed: Packed, device: "Device", background: tuple[float, float, flo
         codes["harmonics"] = _code(packed, "harmonics", count, (3 * harmonics,))
     log_scales = packed.array("log_scales", np.float32, (count, 3))
     dc = packed.array("dc", np.float32, (count, 3))
-    arrays = decoded(means, log_scales, dc, codes, stored_offset(packed))
+    arrays = decoded(means, log_scales, dc, codes, stored_place(packed))
     return splat_model(packed, arrays, device, background)
 
 

@@ -34,11 +34,11 @@ class Content:
         return write_packed(path, self.packed, self.codecs)
 
 
-def stored_offset(packed: Packed) -> Offset:
-    """From where positions count, world units: the fact `offset`. Raises SplatFileError."""
-    value = packed.facts.get("offset")
+def stored_place(packed: Packed, name: str = "offset") -> Offset:
+    """A place among the facts; `offset` is what positions count from. Raises SplatFileError."""
+    value = packed.facts.get(name)
     numbers = value if isinstance(value, list) and len(value) == 3 else []
     if not numbers or not all(type(n) in (int, float) and abs(n) < float("inf") for n in numbers):
-        raise SplatFileError(f"{packed.path}: offset: expected three numbers, found {value!r:.60}")
+        raise SplatFileError(f"{packed.path}: {name}: expected three numbers, found {value!r:.60}")
     x, y, z = map(float, numbers)
     return x, y, z
