@@ -165,6 +165,19 @@ class TrainedModel(nn.Module):
         """Names of the parameters that have a row for each anchor."""
         return ("log_scales", "references", *self.residual_kind.anchor_parameters)
 
+    def grown(self, coordinates: Tensor, references: Tensor, log_scale: Tensor) -> dict[str, Tensor]:
+        """Rows of new anchors by name: at coordinates [A, 3] int32, with references [A, reference_dim] and the
+        logarithm [A] of their sizes in voxels.
+        """
+        new = len(coordinates)
+        return {
+            "coordinates": coordinates,
+            "references": references,
+            "log_scales": log_scale[:, None].repeat(1, 6),
+            "residuals": self.entropy.starting_residuals().repeat(new, 1),
+            "mask": self.mask.new_ones(new, self.mask.shape[1]),
+        }
+
     def readers(self) -> Iterator[Reader]:
         """The layers that take the references."""
         yield from self.heads.readers(self.config.entropy.reference_step)

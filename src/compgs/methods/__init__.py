@@ -51,7 +51,7 @@ Its settings are then `--set coarse.levels=16`, and its tests: a file's bytes by
 a run that was stopped and continued (`tests/methods`).
 """
 
-from compgs.methods import compact3d, compact_3dgs, eagles, hybrid, splats
+from compgs.methods import compact3d, compact_3dgs, cosa, eagles, hybrid, scaffold_gs, splats
 from compgs.methods.method import SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
 
@@ -65,6 +65,8 @@ METHODS: dict[str, Method] = {
         compact3d.COMPACT3D,
         eagles.EAGLES,
         compact_3dgs.COMPACT_3DGS,
+        scaffold_gs.SCAFFOLD_GS,
+        cosa.COSA,
     )
 }
 

@@ -15,6 +15,7 @@ enough (`minimum_share`). From 103 views on, a fifth of 2 V steps is no less tha
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -22,8 +23,7 @@ from torch import Tensor
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
 from compgs.tensors.prediction import Prediction
-from compgs.trained_model import TrainedModel
-from compgs.training.optimizers import replace_rows
+from compgs.training.optimizers import AnchorRows, replace_rows
 
 # (gradient threshold factor, grid size in voxels), coarse first
 GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
@@ -86,6 +86,24 @@ def rate_weight(config: ControlConfig, lmbda: float) -> float:
     return (min(max(lmbda, least), most) / USUAL_LAMBDA) ** config.rate_exponent
 
 
+class Grows(AnchorRows, Protocol):
+    """A model to which control adds anchors."""
+
+    @property
+    def voxel_size(self) -> float: ...
+
+    @property
+    def references(self) -> Tensor:
+        """[N, C] what a new anchor has from those that asked for it: the largest of them, channel by channel."""
+        ...
+
+    def grown(self, coordinates: Tensor, references: Tensor, log_scale: Tensor) -> dict[str, Tensor]:
+        """Rows of new anchors by name, as `replace_rows` takes them, at coordinates [A, 3] int32 with references [A, C]
+        and the logarithm [A] of their cells' sizes in voxels.
+        """
+        ...
+
+
 class AdaptiveControl:
     """Statistics of the coupled primitives since they were last judged, and what follows from them."""
 
@@ -117,7 +135,7 @@ class AdaptiveControl:
     @torch.no_grad()
     def act(
         self,
-        model: TrainedModel,
+        model: Grows,
         optimizer: torch.optim.Adam,
         means: Tensor,
         noise: torch.Generator,
@@ -151,7 +169,7 @@ class AdaptiveControl:
         self.seen[ripe] = 0
 
     @torch.no_grad()
-    def keep(self, model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor) -> None:
+    def keep(self, model: Grows, optimizer: torch.optim.Adam, kept: Tensor) -> None:
         """Remove all anchors but those that are `kept`, [N] bool."""
         none = {
             name: getattr(model, name).detach()[:0]
@@ -160,7 +178,7 @@ class AdaptiveControl:
         self._replace(model, optimizer, kept, none)
 
     def _replace(
-        self, model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]
+        self, model: Grows, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]
     ) -> None:
         replace_rows(model, optimizer, kept, added)
         new = len(added["coordinates"])
@@ -169,10 +187,10 @@ class AdaptiveControl:
             setattr(self, name, torch.cat([old[kept], old.new_zeros(new, *old.shape[1:])]))
 
     def _grow(
-        self, model: TrainedModel, means: Tensor, gradient: Tensor, noise: torch.Generator, lmbda: float
+        self, model: Grows, means: Tensor, gradient: Tensor, noise: torch.Generator, lmbda: float
     ) -> dict[str, Tensor]:
         """New anchors by name of their parameter. gradient: [N, K] mean norms, 0 where not judged."""
-        c, k = self.config.control, model.dimensions.coupled_primitives
+        c, k = self.config.control, means.shape[1]
         flat = gradient.view(-1)
         target = torch.round(means.view(-1, 3) / model.voxel_size)
         inside = (target.abs() < COORDINATE_LIMIT - 16).all(1)
@@ -180,7 +198,7 @@ class AdaptiveControl:
         room = max(0, self.config.model.max_anchors - model.anchors)
         threshold = c.gradient_threshold * rate_weight(c, lmbda)
         coordinates, references = [taken[:0]], [model.references.detach()[:0]]
-        log_scales = [means.new_zeros(0, 6)]
+        log_scales = [means.new_zeros(0)]
         for level, ((factor, size), probability) in enumerate(
             zip(GROWTH_LEVELS, c.growth_probabilities, strict=True)
         ):
@@ -194,17 +212,12 @@ class AdaptiveControl:
             parents = model.references.detach()[slots[asked >= 0] // k]
             coordinates.append(cells)
             references.append(largest(parents, asked[asked >= 0], len(cells)))
-            log_scales.append(means.new_full((len(cells), 6), float(size)).log())
+            log_scales.append(means.new_full((len(cells),), float(size)).log())
             taken = torch.cat([taken, cells])
             room -= len(cells)
-        new = len(taken) - model.anchors
-        return {
-            "coordinates": torch.cat(coordinates).to(torch.int32),
-            "references": torch.cat(references),
-            "log_scales": torch.cat(log_scales),
-            "residuals": model.entropy.starting_residuals().repeat(new, 1),
-            "mask": model.mask.new_ones(new, k),
-        }
+        return model.grown(
+            torch.cat(coordinates).to(torch.int32), torch.cat(references), torch.cat(log_scales)
+        )
 
 
 def new_cells(

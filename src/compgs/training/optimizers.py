@@ -1,8 +1,9 @@
 """Adam over the scene's parameters: one group a learning rate, log-linear decay, rows that come and go (Sec. 3.4)."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -144,9 +145,28 @@ def _adam_rows(rows, parameter, gradient, first, second, numbers, share):
                 p[c] -= rate * mean / (np.sqrt(square) + epsilon)
 
 
+class AnchorRows(Protocol):
+    """A module whose parameters and buffers have a row for each anchor, some of them."""
+
+    coordinates: Tensor  # [N, 3] int32, voxels
+    mask: Tensor  # [N, K] bool: coupled primitives that exist
+
+    @property
+    def anchors(self) -> int: ...
+
+    @property
+    def anchor_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that have such rows."""
+        ...
+
+    def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]: ...
+
+    def get_submodule(self, target: str) -> nn.Module: ...
+
+
 @torch.no_grad()
 def replace_rows(
-    model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]
+    model: AnchorRows, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]
 ) -> None:
     """Keep some anchors and append others, in the parameters and in Adam's moments (zero for new anchors).
 
@@ -167,7 +187,7 @@ def _joined(x: Tensor, kept: Tensor, rows: Tensor) -> Tensor:
 
 @torch.no_grad()
 def replace_parameter(
-    model: nn.Module,
+    model: nn.Module | AnchorRows,
     optimizer: torch.optim.Optimizer | None,
     old: Tensor,
     change: Callable[[Tensor], Tensor],
