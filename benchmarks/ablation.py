@@ -26,7 +26,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -35,6 +35,7 @@ from ablation_figures import check_matplotlib, figure
 from ablation_tables import Record, report, rows_of
 
 from compgs.cli.main import parse as parse_compgs
+from compgs.cli.run_folder import run_settings
 from compgs.cli.train import Train
 from compgs.outputs import write_bytes, write_json
 
@@ -118,15 +119,20 @@ def settings_of(command: Sequence[str]) -> dict[str, Any]:
 
 
 def finished(variant: Variant, command: Sequence[str], folder: Path) -> Record | None:
-    """What is known of a training with the same settings, this variant's or another's of any study in the same runs."""
-    wanted = settings_of(command)
+    """What is known of a training with the same settings, this variant's or another's of any study in the same runs.
+
+    A setting that an older record lacks counts as its default, which is what the program did before there was it.
+    """
+    wanted = run_settings({"preset": "", **settings_of(command)}, variant.name)
     own = folder.with_name(folder.name + ".json")
     others = sorted(path for path in folder.parent.parent.glob("*/*.json") if path != own)
     for path in [own, *others]:
         known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
         if variant.unrounded and "unrounded" not in known:
             continue
-        if known.get("settings") and {name: known["settings"][name] for name in wanted} == wanted:
+        if not known.get("settings"):
+            continue
+        if replace(run_settings(known["settings"], str(path)), preset="") == wanted:
             shown = {"variant": variant.name, "label": variant.label, "curve": variant.curve}
             return {**known, **shown}
     return None

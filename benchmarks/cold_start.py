@@ -67,15 +67,18 @@ def job(name: str, folder: Path, started: float) -> None:
     from compgs.numerics.ahead import entry_of, start_helpers
 
     kernels: list[dict[str, Any]] = []
-    inner = [0.0]
+    inner = [0.0]  # seconds of the kernels that each kernel under way has called for
+    starts: list[float] = []
 
     class Recorder(event.Listener):
         def on_start(self, event: Any) -> None:
-            inner.append(-time.thread_time())
+            starts.append(time.thread_time())
+            inner.append(0.0)
 
         def on_end(self, event: Any) -> None:
-            seconds = inner.pop() + time.thread_time()
-            inner[-1] += seconds  # the caller's clock has counted them
+            elapsed = time.thread_time() - starts.pop()
+            seconds = elapsed - inner.pop()
+            inner[-1] += elapsed
             kernel, arguments = event.data["dispatcher"], event.data["args"]
             if kernel.__module__.startswith("compgs."):
                 kernels.append({"entry": entry_of(kernel, arguments), "seconds": seconds})

@@ -87,6 +87,19 @@ def test_what_another_study_has_trained_is_not_trained_again(tmp_path: Path) -> 
     assert len(trainings.commands) == before + 3  # K = 5 and 15
 
 
+def test_a_setting_that_an_older_record_lacks_counts_as_its_default(tmp_path: Path) -> None:
+    trainings = Trainings()
+    study(tmp_path, trainings, "coupled", "--only", "k5")
+    record = tmp_path / "runs" / "coupled" / "scene_k5_seed0.json"
+    known = json.loads(record.read_text())
+    del known["settings"]["settings"]["training"]["exposure"], known["settings"]["method"]
+    record.write_text(json.dumps(known))
+    study(tmp_path, trainings, "coupled", "--only", "k5")
+    assert len(trainings.commands) == 1
+    study(tmp_path, trainings, "coupled", "--only", "k5", "--set", "training.exposure=true")
+    assert len(trainings.commands) == 2
+
+
 def test_a_variant_that_was_stopped_continues(tmp_path: Path) -> None:
     folder = tmp_path / "runs" / "coupled" / "scene_k5_seed0"
 

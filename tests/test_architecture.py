@@ -118,10 +118,10 @@ def test_imports_point_one_way(file: Path) -> None:
 HEAVY = {"torch", "scipy", "safetensors"}
 TRAINS = {
     "tensors", "entropy", "losses", "stored_weights", "trained_model", "training", "codec.encoder",
-    *(f"methods.parts.{part}" for part in ("vector_quantization", "fake_quantization", "significance")),
+    *(f"methods.parts.{name}" for name in ("vector_quantization", "fake_quantization", "significance")),
+    "methods.compact_3dgs.tensors",
     *(f"methods.anchors.{part}" for part in ("networks", "prediction", "model", "trainer")),
     *(f"methods.cosa.{part}" for part in ("entropy", "model", "trainer", "writer")),
-    "methods.compact_3dgs.tensors",
 }  # fmt: skip
 HOOKS = "hooks"  # what a method's hooks are called, in `methods`: they train, too
 # Where one of HEAVY is loaded beside that, inside a function, for what cannot be done without it.

@@ -92,7 +92,9 @@ class TrainedModel(nn.Module):
     local frame, without the offset: single precision holds it also far from the world's origin.
 
     Embeddings are kept in units of their quantization step, so that a learning rate is a number of steps; log scales
-    in natural units relative to the voxel size.
+    in natural units relative to the voxel size, because their steps are learned: in steps, all primitives would change
+    their size whenever a step does. All else (entropy models, files) sees latents in steps: log scales pass from one to
+    the other in `quantized` and `primitives`.
     """
 
     coordinates: Tensor  # [N, 3] int32, voxels

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-from compgs.config import TrainingConfig
 from compgs.methods import settings_of
 
 STEPS = 40
@@ -14,5 +13,5 @@ def quick(method: str, preset: str = "default", *, steps: int = STEPS, **section
     config = settings_of(method, preset)
     growth = {"densify_every": 0.2, "densify_stop": 0.9, "gradient_threshold": 1e-5}
     sections = {**sections, "splats": {**growth, **sections.get("splats", {})}}
-    changed = {name: replace(getattr(config, name), **values) for name, values in sections.items()}
-    return replace(config, training=TrainingConfig(steps=steps, seed=3), **changed)
+    sections["training"] = {"steps": steps, "seed": 3, **sections.get("training", {})}
+    return replace(config, **{name: replace(getattr(config, name), **v) for name, v in sections.items()})

@@ -253,6 +253,10 @@ def test_colors_learn_by_thirds(blob_scene: Scene) -> None:
         assert rates["hooks/grid"] == rates["hooks/weights_0"]
         seen.append(rates["hooks/grid"])
     assert seen == pytest.approx([0.01, 0.0033, 0.001089, 0.00035937])
+    four, hooks = trainer(blob_scene, training={"views_per_step": 4})
+    hooks.view(blob_scene.train_views[0].camera, four.views.photograph(0), four)
+    rates = {group["name"]: group["rates"][0] for group in four.optimizer.param_groups}
+    assert rates["hooks/grid"] == pytest.approx(0.02), "as those of all other parameters"
 
 
 def test_codebooks_begin_late_and_what_they_miss_shrinks(blob_scene: Scene) -> None:

@@ -140,6 +140,11 @@ def test_latents_learn_slower_the_larger_their_decoder_but_for_opacities(blob_sc
     assert later["hooks/opacity_latents"] == pytest.approx(0.1 * 0.05)
     size = float(torch.linalg.norm(hooks.rotation_decoder.detach()))
     assert later["hooks/rotation_latents"] == pytest.approx(0.1 * 1e-3 / size)
+    # Steps of four views are twice as long, as those of all other parameters.
+    four, hooks = trainer(blob_scene, training={"views_per_step": 4})
+    hooks.view(blob_scene.train_views[0].camera, four.views.photograph(0), four)
+    rates = {group["name"]: group["rates"][0] for group in four.optimizer.param_groups}
+    assert rates["hooks/opacity_latents"] == pytest.approx(2 * 0.1 * 0.05)
 
 
 def test_images_grow_from_coarse_to_fine(blob_scene: Scene) -> None:

@@ -9,8 +9,9 @@ from compgs.cli.inputs import read_bitstream
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Command, FileArgument):
-    """Show what is in a .cgs file: bytes of every component, and bits per anchor and per coupled primitive. Then which
-    beginnings of the file are scenes: after how many bytes the anchors up to each octree level are there.
+    """Show what is in a .cgs file: bytes of every component, and bits per anchor and per coupled primitive.
+
+    Then which beginnings of the file are scenes: after how many bytes the anchors up to each octree level are there.
 
     Example
 

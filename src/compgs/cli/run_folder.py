@@ -136,15 +136,7 @@ def load_settings(folder: Path) -> RunSettings:
     """Raises CheckpointError if the folder holds no run, or not one that can be read."""
     path = folder / SETTINGS_NAME
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        method = _known_method(content.get("method", "compgs"))
-        return RunSettings(
-            preset=str(content["preset"]),
-            scene=_scene_source(content["scene"]),
-            config=config_from_dict(content["settings"], str(path), METHODS[method].settings),
-            method=method,
-            splats=content.get("from_splats"),
-        )
+        return run_settings(json.loads(path.read_text(encoding="utf-8")), str(path))
     except FileNotFoundError as error:
         if (folder / CHECKPOINT_NAME).is_file():
             raise CheckpointError(
@@ -158,6 +150,21 @@ def load_settings(folder: Path) -> RunSettings:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path}: not the settings of a run ({error}); train anew") from error
+
+
+def run_settings(content: dict[str, Any], place: str) -> RunSettings:
+    """Of what `save_settings` has written, also before there were as many settings: those it lacks are as by default.
+
+    Raises ConfigError, which names the `place`, and what a mapping of another kind raises.
+    """
+    method = _known_method(content.get("method", "compgs"))
+    return RunSettings(
+        preset=str(content["preset"]),
+        scene=_scene_source(content["scene"]),
+        config=config_from_dict(content["settings"], place, METHODS[method].settings),
+        method=method,
+        splats=content.get("from_splats"),
+    )
 
 
 def file_and_run(path: Path) -> tuple[Path, RunSettings | None]:

@@ -11,10 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, check_lpips, one_scene
+from compgs.cli.command import (
+    NO_DEFAULT,
+    ComputingCommand,
+    SceneOptions,
+    check_lpips,
+    one_scene,
+    use_threads,
+)
 from compgs.cli.console import duration, print_profile, print_results, say, size
 from compgs.cli.offer import with_poses
 from compgs.cli.progress import counting, training
+from compgs.cli.ranks import among_ranks, several, share_of_threads
 from compgs.cli.run_folder import (
     CHECKPOINT_NAME,
     TRAINING_NAME,
@@ -51,8 +59,8 @@ NOTABLE_MISS = 0.05  # of the size that was asked for
 class Train(ComputingCommand, SceneOptions):
     """Train a scene, write its file, decode the file and compare it with the held-out views.
 
-    The file is a .cgs. With --method the scene is trained by another method, and the file is that method's: of 3dgs,
-    plain 3D Gaussian Splatting without any compression, a .ply: what compression is to be compared with.
+    The file is a .cgs. With --method the scene is trained by another method, and the file is that method's: with 3dgs
+    a .ply of plain, uncompressed 3D Gaussian Splatting, which compression is compared with.
 
     The run's folder then holds the file, results.json, per_view.json, config.json, the renders beside the
     photographs (test/renders, test/gt, contact_sheet.png) and a checkpoint.
@@ -74,6 +82,8 @@ class Train(ComputingCommand, SceneOptions):
     compgs train scenes/garden -o runs/garden --viewer
 
     compgs train -o runs/garden --resume
+
+    torchrun --nproc-per-node 8 -m compgs train scenes/garden -o runs/eight --set training.views_per_step=8 --steps 3750
     """
 
     output: Annotated[
@@ -111,7 +121,7 @@ class Train(ComputingCommand, SceneOptions):
     steps: Annotated[
         int | None, arg(aliases=["--iterations"], metavar="N", help_behavior_hint="(default: the preset's)")
     ] = None
-    """Training steps, one view each; all schedules scale with it."""
+    """Training steps, one view each (--set training.views_per_step: more); all schedules scale with it."""
 
     seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
     """Of every random choice: the same seed on the same CPU gives the same file."""
@@ -155,21 +165,30 @@ class Train(ComputingCommand, SceneOptions):
             raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
         require("train", "training")
         folder = self.output
-        check_output_folder(folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES)
-        settings = self.settings(folder)
-        self.prepare_training("train", "encode", "decode", "render")
-        if self.lpips:
-            check_lpips()
-        if self.viewer:
-            check_viewing(self.viewer_port, "--viewer-port")
-        if self.resume:
-            say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
-        scene, settings = self.read(settings)
-        with (
-            self.viewing(scene, folder.name) as viewing,
-            beginning(folder, settings, anew=not self.resume) as earlier,
-        ):
-            model = self.train(scene, settings, folder, earlier, viewing)
+        with among_ranks(self.device) as leads:
+            if leads:
+                check_output_folder(
+                    folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES
+                )
+            settings = self.settings(folder)
+            self.prepare_training("train", "encode", "decode", "render")
+            if several() and self.threads is None:
+                use_threads(share_of_threads())
+            if self.lpips:
+                check_lpips()
+            if self.viewer and leads:
+                check_viewing(self.viewer_port, "--viewer-port")
+            if self.resume:
+                say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
+            scene, settings = self.read(settings)
+            if not leads:
+                self.train(scene, settings, folder, None, None)
+                return
+            with (
+                self.viewing(scene, folder.name) as viewing,
+                beginning(folder, settings, anew=not self.resume) as earlier,
+            ):
+                model = self.train(scene, settings, folder, earlier, viewing)
         method = METHODS[settings.method]
         path = folder / file_name(folder, method.suffix)
         start = time.perf_counter()
@@ -192,9 +211,10 @@ class Train(ComputingCommand, SceneOptions):
     def read(self, settings: RunSettings) -> tuple["Scene", RunSettings]:
         """The scene; where there are photographs without poses, of those that are found if the user agrees."""
         try:
-            return read_scene(settings.scene), settings
+            # Of several processes each reads the photographs of its own views, when it comes to them.
+            return read_scene(settings.scene, at_once=not several()), settings
         except MissingSparseModel:
-            found = None if self.resume else with_poses(settings.scene)
+            found = None if self.resume or several() else with_poses(settings.scene)
             if found is None:
                 raise
         return read_scene(found), replace(settings, scene=found)

@@ -44,16 +44,21 @@ with three bits of color and stores them so:
         ...
         return splat_model(packed, SplatArrays(...), device, background)
 
-    METHOD = Method("coarse", "Plain 3DGS with few colors", "nobody, 2026", SUFFIX,
+    METHOD = Method("coarse", "Plain 3DGS with few colors", "nobody, 2026", PACKED_SUFFIX,
                     (*SPLAT_SETTINGS, "coarse"), train, write, open_file, CoarseConfig, from_splats=True)
 
 Its settings are then `--set coarse.levels=16`, and its tests: a file's bytes by the method's byte law, the round trip,
 a run that was stopped and continued (`tests/methods`).
 """
 
-from compgs.methods import compact3d, compact_3dgs, cosa, eagles, hybrid, scaffold_gs, splats
-from compgs.methods.method import SPLAT_SETTINGS, Method
+from compgs.methods import hybrid, splats
+from compgs.methods.compact3d import COMPACT3D
+from compgs.methods.compact_3dgs import COMPACT_3DGS
+from compgs.methods.cosa import COSA
+from compgs.methods.eagles import EAGLES
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
+from compgs.methods.scaffold_gs import SCAFFOLD_GS
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -62,12 +67,12 @@ METHODS: dict[str, Method] = {
         splats.PLAIN,
         splats.SPZ,
         splats.SOG,
-        compact3d.COMPACT3D,
-        eagles.EAGLES,
-        compact_3dgs.COMPACT_3DGS,
-        scaffold_gs.SCAFFOLD_GS,
-        cosa.COSA,
+        COMPACT3D,
+        EAGLES,
+        COMPACT_3DGS,
+        SCAFFOLD_GS,
+        COSA,
     )
 }
 
-__all__ = ["METHODS", "SPLAT_SETTINGS", "Method", "settings_of", "train", "write"]
+__all__ = ["METHODS", "PACKED_SUFFIX", "SPLAT_SETTINGS", "Method", "settings_of", "train", "write"]

@@ -15,17 +15,18 @@ if TYPE_CHECKING:
     from compgs.scene.views import Scene
     from compgs.training.loop import Run
 
-# As in `compgs.formats.packed`, which would load numpy and more with the command line's help.
-SUFFIX = ".packed"
 # Settings of plain 3DGS, which methods that build on it have, too.
 SPLAT_SETTINGS = (
     "splats",
     "training.steps",
+    "training.views_per_step",
     "training.seed",
     "training.ssim_weight",
     "training.exposure",
     "training.checkpoint_minutes",
 )
+# Of files in the shared container: `compgs.formats.packed.SUFFIX`, without loading the formats.
+PACKED_SUFFIX = ".packed"
 Presets = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 

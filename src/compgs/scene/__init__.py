@@ -35,6 +35,7 @@ def load_scene(
     holdout: bool = True,  # False: all views are trained on
     background: tuple[float, float, float] | None = None,  # display RGB, 0 to 1; None: the layout's
     progress: Progress | None = None,  # called with (done, total) views
+    at_once: bool = True,  # photographs that all fit into memory are decoded now; False: when somebody looks
 ) -> Scene:
     """Reads a capture: COLMAP, Blender (`transforms_train.json`) or nerfstudio (`transforms.json`).
 
@@ -55,7 +56,7 @@ def load_scene(
 
     behind = background or capture.background
     cut_out = capture.cut_out and background is None
-    views = load_views(capture.images, downscale, None if cut_out else behind, progress)
+    views = load_views(capture.images, downscale, None if cut_out else behind, progress, at_once=at_once)
     held_out = _held_out(capture, test_every) if holdout else frozenset()
     points, notes = _enough_points(capture, views)
     return Scene(

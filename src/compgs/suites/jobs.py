@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from compgs.errors import SceneError
+from compgs.evaluation.reports.runs import RESULTS_NAME
 from compgs.outputs import write_json
 from compgs.suites.suite import MethodEntry, SceneEntry, SetValue, Suite
 
@@ -17,7 +18,6 @@ RUNS = "runs"  # folder of the runs inside the output
 JOB_NAME = "job.json"  # in a run's folder: what was asked for
 LOG_NAME = "output.txt"
 CHECKPOINT_NAME = "checkpoint.safetensors"
-RESULTS_NAME = "results.json"
 
 
 @dataclass(frozen=True)

@@ -6,45 +6,36 @@ ran. Seconds differ from machine to machine and are in `complexity.*`.
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from compgs.evaluation.reports import Run, read_runs, report
-from compgs.evaluation.reports.summary import ALL_SCENES, PLAIN_3DGS, Point, points_of, scenes
-from compgs.evaluation.reports.tables import Column, Table, Value, to_csv, to_latex, to_markdown
+from compgs.evaluation.reports.summary import (
+    COLUMNS,
+    PLAIN_3DGS,
+    Point,
+    means_table,
+    points_of,
+    results_table,
+    scenes,
+)
+from compgs.evaluation.reports.tables import Table, Value, to_csv, to_latex, to_markdown
 from compgs.outputs import write_bytes
 from compgs.suites.jobs import Job
 from compgs.suites.suite import PublishedRow, Suite
 
 PUBLISHED = " (published)"  # after the name of a method that did not run here
-QUALITY = (
-    Column("method", "method"),
-    Column("rate", "rate"),
-    Column("psnr", "PSNR, dB", ".2f"),
-    Column("ssim", "SSIM", ".4f"),
-    Column("lpips", "LPIPS", ".4f"),
-    Column("bytes", "bytes", ",.0f"),
-    Column("ratio", "3DGS / bytes", ".1f"),
-)
-TIMES = (
-    Column("method", "method"),
-    Column("rate", "rate"),
-    Column("train_seconds", "training, s", ",.0f"),
-    Column("decode_seconds", "decoding, s", ".3f"),
-    Column("frames_per_second", "frames/s", ".1f"),
-    Column("primitives", "primitives", ",.0f"),
-)
+QUALITY = ("method", "rate", "psnr", "ssim", "lpips", "bytes", "ratio")
+TIMES = ("method", "rate", "train_seconds", "decode_seconds", "frames_per_second", "primitives")
 SURVEY_HEAD = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
 
 
 def runs_of(jobs: Sequence[Job]) -> tuple[list[Run], tuple[str, ...]]:
     """The runs of finished jobs, by the names that the suite gives them, and what they lack. Raises ReportError."""
-    done = sorted((job for job in jobs if job.done), key=lambda job: job.folder.name)
-    order = {job.folder: i for i, job in enumerate(jobs)}
     named = []
     notes: list[str] = []
-    for job in sorted(done, key=lambda job: order[job.folder]):
+    for job in (job for job in jobs if job.done):
         (run,), lacks = read_runs([job.folder])
         named.append(replace(run, scene=job.scene, method=job.method, rate=job.rate, seed=job.seed))
         notes += [lack for lack in lacks if "training curve" not in lack]
@@ -72,67 +63,55 @@ def write_results(
             path = output / "survey" / suite.survey / f"{scene}.csv"
             write_bytes(path, survey_file([p for p in points if p.scene == scene]).encode())
             files.append(path)
-    written = report(runs, output / "report.html", title=suite.title, overwrite=True)
+    others = made[:1] if suite.published else []
+    written = report(runs, output / "report.html", title=suite.title, others=others, overwrite=True)
     return made, [*files, *written.files]
 
 
 def tables_of(points: Sequence[Point], suite: Suite, notes: Sequence[str] = ()) -> list[Table]:
     """Quality over all scenes with published rows, complexity, and a table for each scene."""
-    whole = [point for point in mean_points(points, len(suite.scenes))]
     several = len(suite.scenes) > 1
+    whole = means_table(points, len(suite.scenes)) if several else results_table(points)
+    rows = [] if whole is None else whole.records()
     result = [
-        quality_table("table", suite.title, whole, suite.published, notes),
-        Table(
-            "complexity",
-            f"{suite.title}: complexity",
-            TIMES,
-            tuple(tuple(_value(row, column.key) for column in TIMES) for row in whole),
-        ),
+        quality_table("table", suite.title, rows, suite.published, notes),
+        _table("complexity", f"{suite.title}: complexity", TIMES, rows),
     ]
-    if several:
-        for scene in scenes(points):
-            of_scene = mean_points([p for p in points if p.scene == scene], 1)
-            result.append(quality_table(f"scene_{scene}", f"{suite.title}: {scene}", of_scene, (), ()))
-    return result
+    for scene in scenes(points) if several else ():
+        mine = results_table([point for point in points if point.scene == scene])
+        result.append(
+            _table(f"scene_{scene}", f"{suite.title}: {scene}", QUALITY, mine.records(), mine.notes)
+        )
+    return [table.without_empty_columns() for table in result]
 
 
-Row = dict[str, Value]
-
-
-def mean_points(points: Sequence[Point], count: int) -> list[Row]:
-    """Means over the scenes, of each method and rate that has all `count` of them, in the order in which they come."""
-    groups: dict[tuple[str, str], list[Point]] = {}
-    for point in points:
-        groups.setdefault((point.method, point.rate), []).append(point)
-    plain = {point.scene: point.mean("bytes") for point in points if point.method == PLAIN_3DGS}
-    rows = []
-    for (method, rate), group in groups.items():
-        if len({point.scene for point in group}) < count:
-            continue
-        row: Row = {"method": method, "rate": rate or None}
-        for name in ("psnr", "ssim", "lpips", "bytes", "train_seconds", "decode_seconds", "frames_per_second",
-                     "primitives"):  # fmt: skip
-            row[name] = _mean([point.mean(name) for point in group])
-        size, reference = row["bytes"], _mean([plain.get(point.scene) for point in group])
-        row["ratio"] = reference / size if isinstance(size, float) and size and reference else None
-        rows.append(row)
-    return rows
+Row = Mapping[str, Value]
 
 
 def quality_table(
     key: str, title: str, rows: Sequence[Row], published: Sequence[PublishedRow], notes: Sequence[str]
 ) -> Table:
     """Ours, then published rows, whose ratios are to the published 3DGS."""
-    found = [tuple(_value(row, column.key) for column in QUALITY) for row in rows]
     plain = [row.bytes for row in published if row.method == PLAIN_3DGS and row.bytes]
-    for row in published:
-        ratio = plain[0] / row.bytes if plain and row.bytes else None
-        found.append(
-            (row.method + PUBLISHED, row.rate or None, row.psnr, row.ssim, row.lpips, row.bytes, ratio)
-        )
+    theirs: list[Row] = [
+        {
+            "method": row.method + PUBLISHED,
+            "rate": row.rate or None,
+            **{name: getattr(row, name) for name in ("psnr", "ssim", "lpips", "bytes")},
+            "ratio": plain[0] / row.bytes if plain and row.bytes else None,
+        }
+        for row in published
+    ]
     sources = dict.fromkeys(row.source for row in published)
     more = (f"Published rows, by their own evaluation: {'; '.join(sources)}.",) if published else ()
-    return Table(key, title, QUALITY, tuple(found), (*more, *notes)).without_empty_columns()
+    return _table(key, title, QUALITY, [*rows, *theirs], (*more, *notes))
+
+
+def _table(
+    key: str, title: str, columns: Sequence[str], rows: Sequence[Row], notes: Sequence[str] = ()
+) -> Table:
+    cells = tuple(tuple(row.get(column) for column in columns) for row in rows)
+    return Table(key, title, tuple(COLUMNS[column] for column in columns), cells, tuple(notes))
 
 
 def survey_file(points: Sequence[Point]) -> str:
@@ -145,23 +124,3 @@ def survey_file(points: Sequence[Point]) -> str:
         values = [point.mean(key) for key in ("psnr", "ssim", "lpips", "bytes", "primitives")]
         writer.writerow([name, *("" if value is None else value for value in values)])
     return text.getvalue()
-
-
-def _value(row: Row, key: str) -> Value:
-    return row.get(key)
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known and len(known) == len(values) else None
-
-
-__all__ = [
-    "ALL_SCENES",
-    "mean_points",
-    "quality_table",
-    "runs_of",
-    "survey_file",
-    "tables_of",
-    "write_results",
-]

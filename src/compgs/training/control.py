@@ -14,6 +14,7 @@ In few steps a primitive cannot be seen often. The published minimum of more tha
 enough (`minimum_share`). From 103 views on, a fifth of 2 V steps is no less than the published minimum.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -47,6 +48,12 @@ class ControlSchedule:
     stop: int
     every: int
     observe: int = 0
+    views: int = 1  # of a step
+
+    @property
+    def between(self) -> int:
+        """Views that are looked at between two controls."""
+        return self.every * self.views
 
     def active(self, step: int) -> bool:
         """Statistics are gathered in this step."""
@@ -60,24 +67,24 @@ class ControlSchedule:
         return step >= self.stop
 
 
-def make_schedule(config: ControlConfig, steps: int, views: int) -> ControlSchedule:
+def make_schedule(config: ControlConfig, steps: int, views: int, views_per_step: int = 1) -> ControlSchedule:
     """Fractions of the run in steps, or passes over the views where these end earlier; see the module's docstring.
 
     Between two controls every view is seen about once, at least. Statistics begin early enough for the first control
     to judge as many steps as the others.
     """
+
+    def pass_steps(passes: float) -> int:
+        return round(passes * max(views, SHORTEST_PASS) / views_per_step)
+
     start, every = round(config.start * steps), round(config.every * steps)
     if config.start_passes is not None:  # Steps count from 0: the last of n passes is step n V - 1.
-        start = min(start, _pass_steps(config.start_passes, views) - 1)
+        start = min(start, pass_steps(config.start_passes) - 1)
     if config.every_passes is not None:
-        every = min(every, _pass_steps(config.every_passes, views))
-    start, every = max(1, start), max(1, every, views)
-    observe = min(_pass_steps(config.observe_passes, views), start + 1 - every)
-    return ControlSchedule(start, round(config.stop * steps), every, max(0, observe))
-
-
-def _pass_steps(passes: float, views: int) -> int:
-    return round(passes * max(views, SHORTEST_PASS))
+        every = min(every, pass_steps(config.every_passes))
+    start, every = max(1, start), max(1, every, math.ceil(views / views_per_step))
+    observe = min(pass_steps(config.observe_passes), start + 1 - every)
+    return ControlSchedule(start, round(config.stop * steps), every, max(0, observe), views_per_step)
 
 
 def rate_weight(config: ControlConfig, lmbda: float) -> float:
@@ -142,12 +149,12 @@ class AdaptiveControl:
         lmbda: float,
     ) -> None:
         """Grow and prune. means: [N, K, 3] of all coupled primitives, world units; lmbda: the rate's present weight."""
-        c, n, every = self.config.control, model.anchors, self.schedule.every
-        judged = self.drawn >= min(c.minimum_views, int(c.minimum_share * every))
+        c, n, views = self.config.control, model.anchors, self.schedule.between
+        judged = self.drawn >= min(c.minimum_views, int(c.minimum_share * views))
         gradient = torch.where(judged, self.gradient / self.drawn.clamp_min(1), 0.0)
         added = self._grow(model, means, gradient, noise, lmbda)
 
-        ripe = self.seen >= max(c.opacity_views, int(c.opacity_share * every))
+        ripe = self.seen >= max(c.opacity_views, int(c.opacity_share * views))
         transparent = self.opacity / self.seen.clamp_min(1) < c.opacity_threshold
         kept = ~(ripe & transparent)
         if not kept.any():

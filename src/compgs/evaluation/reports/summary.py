@@ -30,6 +30,7 @@ NUMBERS = (
     Column("decode_seconds", "decoding, s", ".3f"),
     Column("frames_per_second", "frames/s", ".1f"),
 )
+COLUMNS = {column.key: column for column in (*NAMES, *NUMBERS)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +91,12 @@ def methods(of: Sequence[Run] | Sequence[Point]) -> list[str]:
     return list(dict.fromkeys(each.method for each in of))
 
 
-def means_table(points: Sequence[Point]) -> Table | None:
-    """Means over all scenes, of each method and rate that has them all; None of a single scene."""
-    count = len(scenes(points))
+def means_table(points: Sequence[Point], count: int | None = None) -> Table | None:
+    """Means over all scenes, of each method and rate that has them all; None of a single scene.
+
+    `count`: of the scenes, where more are to be there than the points have.
+    """
+    count = count or len(scenes(points))
     groups: dict[tuple[str, str], list[Point]] = {}
     for point in points:
         groups.setdefault((point.method, point.rate), []).append(point)

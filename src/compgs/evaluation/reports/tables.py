@@ -45,6 +45,11 @@ class Table:
     def __post_init__(self) -> None:
         assert all(len(row) == len(self.columns) for row in self.rows), self.key
 
+    def records(self) -> list[dict[str, Value]]:
+        """The rows by the columns' keys."""
+        keys = [column.key for column in self.columns]
+        return [dict(zip(keys, row, strict=True)) for row in self.rows]
+
     def without_empty_columns(self) -> "Table":
         """Without columns in which nothing is known."""
         kept = [i for i in range(len(self.columns)) if any(row[i] is not None for row in self.rows)]

@@ -111,7 +111,7 @@ class AnchorTrainer:
 
     def train_step(self) -> StepResult:
         """Predict, rasterize, compare, pull; then grow and prune."""
-        index = self.views.next()
+        (index,) = self.views.next()
         camera, photograph = self.scene.train_views[index].camera, self.views.photograph(index)
         values = self.values()
         rows = self.visible_anchors(values, camera)
@@ -123,7 +123,7 @@ class AnchorTrainer:
         added = self.added()
         loss = loss if added is None else loss + added
         self.backward(loss, rendered, prediction.gaussians)
-        self.update()
+        self.update(index)
         self.observe(rows, prediction, rendered, camera)
         self.finish_step()
         return StepResult(loss.detach(), rendered.image.detach(), photograph)
@@ -170,12 +170,12 @@ class AnchorTrainer:
         """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
         loss.backward()
 
-    def update(self) -> None:
+    def update(self, view: int) -> None:
         t = self.config.training
         set_learning_rates(self.optimizer, self.progress, DECAYS[t.schedule], t.head_warm_up)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        self.views.learn(self.progress)
+        self.views.learn(self.progress, [view], self.views.exposure_gradients([view]))
 
     def observe(self, rows: Tensor, prediction: Prediction, rendered: RasterResult, camera: Camera) -> None:
         """The statistics that growth and pruning go by."""
@@ -215,7 +215,8 @@ class AnchorTrainer:
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | None) -> None:
+        assert path is not None, "it trains in one process"
         tensors = {f"model/{name}": value for name, value in self.model.state_dict().items()}
         moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
         tensors |= {f"optimizer/{name}": value for name, value in moments.items()}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from compgs.config import Config, Range, Share
-from compgs.methods.method import SPLAT_SETTINGS, SUFFIX, Method
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -93,7 +93,7 @@ COMPACT3D = Method(
     name=NAME,
     description="plain 3DGS, codebooks learned while training",
     reference="Navaneet et al., CompGS: Smaller and Faster Gaussian Splatting with Vector Quantization, ECCV 2024",
-    suffix=SUFFIX,
+    suffix=PACKED_SUFFIX,
     uses=(*SPLAT_SETTINGS, NAME),
     train=train,
     write=write,

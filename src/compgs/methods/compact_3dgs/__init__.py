@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from compgs.config import Config, LearningRate, Positive, Range, Share, SplatConfig
-from compgs.methods.method import SPLAT_SETTINGS, SUFFIX, Method
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -95,7 +95,7 @@ COMPACT_3DGS = Method(
     name="compact-3dgs",
     description="3DGS with learned masks, color from a hash grid, residual codebooks of scales and rotations",
     reference="Lee et al., Compact 3D Gaussian Representation for Radiance Field, CVPR 2024",
-    suffix=SUFFIX,
+    suffix=PACKED_SUFFIX,
     uses=(*SPLAT_SETTINGS, "compact"),
     train=train,
     write=write,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compgs.methods.cosa.settings import PRESETS, SETTINGS, CosaConfig
-from compgs.methods.method import SUFFIX, Method
+from compgs.methods.method import PACKED_SUFFIX, Method
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -45,7 +45,7 @@ COSA = Method(
     name="cosa-gs",
     description="anchors in a causal chain, bits of the whole scene in the loss",
     reference="COSA-GS, arXiv 2609.30245, 2026",
-    suffix=SUFFIX,
+    suffix=PACKED_SUFFIX,
     uses=SETTINGS,
     train=_train,
     write=_write,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from compgs.config import Config, LearningRate, Positive, Range, Share, SplatConfig
-from compgs.methods.method import SPLAT_SETTINGS, SUFFIX, Method
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -98,7 +98,7 @@ EAGLES = Method(
     name="eagles",
     description="3DGS with integer latents and linear decoders, trained from coarse images, pruned by influence",
     reference="Girish et al., EAGLES, ECCV 2024",
-    suffix=SUFFIX,
+    suffix=PACKED_SUFFIX,
     uses=(*SPLAT_SETTINGS, "eagles"),
     train=train,
     write=write,

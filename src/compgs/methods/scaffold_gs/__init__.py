@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig
 from compgs.methods.anchors.settings import ANCHOR_SETTINGS, AnchorSection
-from compgs.methods.method import SUFFIX, Method
+from compgs.methods.method import PACKED_SUFFIX, Method
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -95,7 +95,7 @@ SCAFFOLD_GS = Method(
     name="scaffold-gs",
     description="anchors that spawn Gaussians by view-dependent networks, uncompressed",
     reference="Lu et al., Scaffold-GS, CVPR 2024",
-    suffix=SUFFIX,
+    suffix=PACKED_SUFFIX,
     uses=ANCHOR_SETTINGS,
     train=train,
     write=write,
