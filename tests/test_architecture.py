@@ -78,9 +78,10 @@ ALLOWED = {
         "methods",
     },
     "suites": BASE | {"evaluation", "methods", "metrics"},
+    "tiles": BASE | {"scene", "formats", "suites"},
     "cli": BASE
     | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "compressing", "viewer", "methods", "reconstruct", "suites"},
+    | {"trained_model", "exporting", "compressing", "viewer", "methods", "reconstruct", "suites", "tiles"},
     "__main__": BASE | {"cli"},
 }
 
@@ -119,7 +120,7 @@ HEAVY = {"torch", "scipy", "safetensors"}
 TRAINS = {
     "tensors", "entropy", "losses", "stored_weights", "trained_model", "training", "codec.encoder",
     *(f"methods.parts.{name}" for name in ("vector_quantization", "fake_quantization", "significance")),
-    "methods.compact_3dgs.tensors",
+    "methods.compact_3dgs.tensors", "methods.c3dgs.sensitivity", "methods.c3dgs.shapes",
     *(f"methods.anchors.{part}" for part in ("networks", "prediction", "model", "trainer")),
     *(f"methods.cosa.{part}" for part in ("entropy", "model", "trainer", "writer")),
 }  # fmt: skip

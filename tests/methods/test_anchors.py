@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from compgs.config import Config, ModelConfig, TrainingConfig
+from compgs.errors import ConfigError
 from compgs.methods.anchors.model import AnchorModel, initial_anchors
 from compgs.methods.anchors.prediction import predict_anchors
 from compgs.methods.anchors.scene import network_shapes
@@ -135,3 +136,11 @@ def test_a_profile_names_the_parts_of_a_step(blob_scene: Scene, config: Config) 
         "projection, backward",
     }
     assert all(milliseconds > 0 for milliseconds in found.values())
+
+
+def test_several_views_a_step_are_refused(blob_scene: Scene, config: Config) -> None:
+    several = replace(config, training=replace(config.training, views_per_step=2))
+    with pytest.raises(
+        ConfigError, match="method anchors trains in one process, with one view a step; found 1 and 2"
+    ):
+        AnchorTrainer(blob_scene, several, torch.device("cpu"), "anchors")

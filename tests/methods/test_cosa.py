@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from compgs.codec.integer_network import FRACTION_BITS
+from compgs.config import Config
 from compgs.errors import CompGSError, NotEncodable, SplatFileError
 from compgs.formats import component_bytes, open_scene, packed
 from compgs.methods import METHODS, settings_of, train, write
@@ -48,6 +49,15 @@ def file(trained: CosaModel, tmp_path: Path) -> Path:
     path = tmp_path / "a.packed"
     write(trained, path, method="cosa-gs")
     return path
+
+
+def test_presets_differ_in_what_they_are_for() -> None:
+    default, paper, quick = (settings_of("cosa-gs", name) for name in ("default", "paper", "quick"))
+    assert default.training.lmbda == paper.training.lmbda == quick.training.lmbda
+    assert default.control == paper.control == quick.control != Config().control
+    assert (default.model.coupled_primitives, paper.model.coupled_primitives) == (5, 10)
+    assert isinstance(paper, CosaConfig) and (paper.cosa.head_bits, paper.cosa.symbols_start) == (16, 1.0)
+    assert quick.training.steps == Config().training.steps * 4000 // 30_000
 
 
 def test_the_suffix_is_the_containers() -> None:
@@ -244,6 +254,10 @@ def test_what_has_diverged_is_not_written(blob_scene: Scene, tmp_path: Path) -> 
     with torch.no_grad():
         trainer.model.features[3, 2] = torch.nan
     with pytest.raises(NotEncodable, match="features"):
+        write(trainer.model, tmp_path / "a", method="cosa-gs")
+    with torch.no_grad():
+        trainer.model.features[3, 2] = 1e6
+    with pytest.raises(NotEncodable, match=r"a feature is .* steps from"):
         write(trainer.model, tmp_path / "a", method="cosa-gs")
     with torch.no_grad():
         trainer.model.features.zero_()

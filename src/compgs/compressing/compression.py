@@ -228,7 +228,7 @@ def check_places(output: Path, *, overwrite: bool) -> None:
 
 def opened(source: Path, looking: Looking, device: str | None) -> SplatModel:
     """The splats of a file. Raises SplatFileError, NotACompGSFile."""
-    if format_of(source).name == "cgs":
+    if format_of(source).name in ("cgs", "tiles"):
         raise NotACompGSFile(
             f"{source}: a .cgs file is compressed already; `compgs encode` makes one smaller without training"
         )

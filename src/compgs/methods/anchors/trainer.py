@@ -10,6 +10,7 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
+from compgs.errors import ConfigError
 from compgs.gaussians import Gaussians
 from compgs.losses import Target, photometric_loss, scale_regularizer, scale_unit
 from compgs.methods.anchors.model import AnchorModel, control_settings, initial_anchors
@@ -22,6 +23,7 @@ from compgs.scene.world import local_scene
 from compgs.tensors.prediction import Prediction, camera_center
 from compgs.tensors.visibility import visible_mask
 from compgs.training.checkpoint import (
+    Writer,
     check_same_run,
     optimizer_tensors,
     read_checkpoint_file,
@@ -30,6 +32,7 @@ from compgs.training.checkpoint import (
     write_checkpoint_file,
 )
 from compgs.training.control import AdaptiveControl, make_schedule
+from compgs.training.distributed import world
 from compgs.training.loop import Run, StepResult, rasterize_step, run_to_end
 from compgs.training.optimizers import ADAM_EPSILON, DECAYS, set_learning_rates
 from compgs.training.restoring import (
@@ -48,7 +51,7 @@ from compgs.training.views_in_turn import ViewsInTurn
 
 
 class AnchorTrainer:
-    """State of a run: model, optimizer, control, and the order in which views come.
+    """State of a run: model, optimizer, control, and the order in which views come, one a step.
 
         values ──predict──► Gaussians ──rasterize──► image ──compare, + added──► loss ──► step ──► finish_step
 
@@ -68,6 +71,11 @@ class AnchorTrainer:
         model: AnchorModel | None = None,
     ) -> None:
         t = config.training
+        if world() > 1 or t.views_per_step > 1:
+            raise ConfigError(
+                f"method {method} trains in one process, with one view a step; found {world()} and "
+                f"{t.views_per_step}: start it without torchrun, and without training.views_per_step"
+            )
         self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure)
         self.config = config
         self.device = device
@@ -172,10 +180,11 @@ class AnchorTrainer:
 
     def update(self, view: int) -> None:
         t = self.config.training
+        exposures = self.views.exposure_gradients([view])
         set_learning_rates(self.optimizer, self.progress, DECAYS[t.schedule], t.head_warm_up)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        self.views.learn(self.progress, [view], self.views.exposure_gradients([view]))
+        self.views.learn(self.progress, [view], exposures)
 
     def observe(self, rows: Tensor, prediction: Prediction, rendered: RasterResult, camera: Camera) -> None:
         """The statistics that growth and pruning go by."""
@@ -215,7 +224,7 @@ class AnchorTrainer:
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
-    def save(self, path: Path | None) -> None:
+    def save(self, path: Path | None, writer: Writer | None = None) -> None:
         assert path is not None, "it trains in one process"
         tensors = {f"model/{name}": value for name, value in self.model.state_dict().items()}
         moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
@@ -230,7 +239,7 @@ class AnchorTrainer:
             "frame": json.dumps(frame),
             "state": json.dumps(state),
         }
-        write_checkpoint_file(path, self.method, tensors, metadata)
+        write_checkpoint_file(path, self.method, tensors, metadata, writer)
 
     def more_state(self) -> dict[str, Any]:
         """What else a checkpoint says, as JSON takes it."""

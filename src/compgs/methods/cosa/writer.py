@@ -9,6 +9,7 @@ from torch import nn
 
 from compgs.codec.anchor_order import canonical_order
 from compgs.codec.encoder import ONE, integer_network, quantized_tensor
+from compgs.codec.format import MAX_SYMBOL
 from compgs.codec.integer_network import IntegerLayer, IntegerNetwork
 from compgs.codec.mask_coder import encode_masks
 from compgs.codec.octree import encode_positions
@@ -85,7 +86,13 @@ class _Rounding:
         y = self.y[group]
         if group == "latent":
             y, self.latents = y[:, self.latents : self.latents + 1], self.latents + 1
-        symbols = np.rint(y - means / ONE).astype(np.int32)
+        steps = np.rint(y - means / ONE)
+        if steps.size and np.abs(steps).max() > MAX_SYMBOL:
+            raise NotEncodable(
+                f"a {group.replace('_', ' ')} is {np.abs(steps).max():.3g} steps from what is expected of it, at most "
+                f"{MAX_SYMBOL} can be coded: the training has diverged"
+            )
+        symbols = steps.astype(np.int32)
         self.symbols.append(symbols)
         self.tables.append(tables)
         return symbols
