@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import compgs
 from compgs.errors import SplatFileError
 from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import Packed, read, write_packed
@@ -106,6 +107,13 @@ def test_the_file_shows_what_the_training_drew(blob_scene: Scene) -> None:
 
 def test_a_run_that_was_stopped_continues_exactly(check_continues: Any) -> None:
     check_continues("compact-3dgs", small(codes=8, codes_start=0.4), (10, 30))
+
+
+def test_what_holds_no_lasting_splats_is_neither_exported_nor_compressed(file: Path, tmp_path: Path) -> None:
+    for convert in (compgs.export, compgs.compress):
+        with pytest.raises(SplatFileError, match=r"a\.packed: its splats are made anew for each camera"):
+            convert(file, tmp_path / ("b.ply" if convert is compgs.export else "b.cgs"))
+    assert not list(tmp_path.iterdir())
 
 
 def changed(file: Path, path: Path, facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> Path:

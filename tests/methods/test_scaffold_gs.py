@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import compgs
 from compgs.errors import SplatFileError
 from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import Packed, read, write_packed
@@ -101,6 +102,13 @@ def test_settings_are_those_of_the_release() -> None:
     assert replace(quick, steps=30_000) == config.training and quick.steps == 4_000
     scaled = settings_of("scaffold-gs", "scaled")
     assert (scaled.model, scaled.control) == (m, c) and scaled.training != config.training
+
+
+def test_what_holds_no_lasting_splats_is_neither_exported_nor_compressed(file: Path, tmp_path: Path) -> None:
+    for convert in (compgs.export, compgs.compress):
+        with pytest.raises(SplatFileError, match=r"a\.packed: its splats are made anew for each camera"):
+            convert(file, tmp_path / ("b.ply" if convert is compgs.export else "b.cgs"))
+    assert not list(tmp_path.iterdir())
 
 
 def changed(file: Path, path: Path, facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> Path:
