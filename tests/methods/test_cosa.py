@@ -10,7 +10,7 @@ import torch
 
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.config import Config
-from compgs.errors import CompGSError, ConfigError, NotEncodable, SplatFileError
+from compgs.errors import CompGSError, NotEncodable, SplatFileError
 from compgs.exporting import export
 from compgs.formats import component_bytes, open_scene, packed
 from compgs.methods import METHODS, settings_of, train, write
@@ -331,7 +331,7 @@ def test_facts_that_no_encoder_writes_are_refused(name: str, value: Any, content
 
 
 def test_its_networks_are_not_exported(file: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"a\.packed: a scene of another method"):
+    with pytest.raises(SplatFileError, match=r"a\.packed: its splats are made anew for each camera"):
         export(file, tmp_path / "a.ply")
 
 
