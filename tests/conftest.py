@@ -1,7 +1,8 @@
-"""What tests of several rooms need: Ctrl-C that is heard, a scene to train, a small .cgs file, and a browser."""
+"""What tests of several rooms need: Ctrl-C that is heard, a scene to train, a small .cgs file, splats, a browser."""
 
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,9 @@ from compgs.cameras import Camera
 from compgs.codec.encoder import to_content
 from compgs.codec.writer import write_content
 from compgs.config import Config, ModelConfig
-from compgs.evaluation.camera_path import orbit
+from compgs.evaluation.camera_path import look_at, orbit
 from compgs.gaussians import Gaussians
+from compgs.model.splats import SplatArrays
 from compgs.scene.views import Points, Scene, View
 from compgs.tensors.rasterize import rasterize
 from compgs.trained_model import TrainedModel
@@ -25,16 +27,25 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """World to camera [4, 4], OpenCV axes, world z up."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ eye
-    return pose
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture
+def random_splats() -> Callable[..., SplatArrays]:
+    """Small splats in a unit cube, of every opacity: `random_splats(count, degree)`."""
+
+    def make(count: int = 60, degree: int = 1) -> SplatArrays:
+        chance = np.random.default_rng(0)
+        return SplatArrays(
+            means=chance.random((count, 3)),
+            log_scales=np.full((count, 3), -2.5),
+            quaternions=chance.normal(size=(count, 4)),
+            opacity_logits=np.linspace(-3, 3, count),
+            dc=chance.normal(size=(count, 3)),
+            rest=0.2 * chance.normal(size=(count, (degree + 1) ** 2 - 1, 3)),
+        ).each(np.float32)
+
+    return make
 
 
 @pytest.fixture(scope="session")
@@ -55,7 +66,7 @@ def blob_scene() -> Scene:
     for i in range(9):
         angle = 2 * np.pi * i / 9
         eye = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.5])
-        camera = Camera(look_at(eye, np.zeros(3)), 50.0, 50.0, 24.0, 18.0, 48, 36)
+        camera = Camera(look_at(eye, np.zeros(3), UP), 50.0, 50.0, 24.0, 18.0, 48, 36)
         image = rasterize(gaussians, camera).image.clamp(0, 1)
         views.append(View(f"view_{i}", camera, (image * 255).round().to(torch.uint8).numpy()))
     return Scene(

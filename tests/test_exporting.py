@@ -1,6 +1,7 @@
 """Export from a file to a file: what is written, what is measured, what is refused."""
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,18 +20,6 @@ from compgs.formats.ply import ply_size
 from compgs.model.splats import SplatArrays, SplatModel
 
 
-def splats(count: int = 60, degree: int = 1) -> SplatArrays:
-    chance = np.random.default_rng(0)
-    return SplatArrays(
-        means=chance.random((count, 3)),
-        log_scales=np.full((count, 3), -2.5),
-        quaternions=chance.normal(size=(count, 4)),
-        opacity_logits=np.linspace(-3, 3, count),
-        dc=chance.normal(size=(count, 3)),
-        rest=0.2 * chance.normal(size=(count, (degree + 1) ** 2 - 1, 3)),
-    ).each(np.float32)
-
-
 @pytest.fixture(autouse=True)
 def fewer_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     """Eight all around, for the tests to take less time."""
@@ -38,9 +27,9 @@ def fewer_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def ply(tmp_path: Path) -> Path:
+def ply(tmp_path: Path, random_splats: Callable[..., SplatArrays]) -> Path:
     path = tmp_path / "a.ply"
-    path.write_bytes(encoded(splats(), "ply"))
+    path.write_bytes(encoded(random_splats(), "ply"))
     return path
 
 
@@ -49,14 +38,16 @@ def test_the_public_face_has_it() -> None:
 
 
 @pytest.mark.parametrize("kind", ["ply", "glb"])
-def test_splats_that_nothing_is_asked_of_keep_their_numbers(ply: Path, tmp_path: Path, kind: str) -> None:
+def test_splats_that_nothing_is_asked_of_keep_their_numbers(
+    ply: Path, tmp_path: Path, kind: str, random_splats: Callable[..., SplatArrays]
+) -> None:
     out = tmp_path / f"b.{kind}"
     done = export(ply, out)
     assert done.bytes == out.stat().st_size and done.splats == 60 and done.dropped == 0
     assert done.worst > 90 and len(done.psnr) == 20
     again = open_scene(out)
     assert isinstance(again, SplatModel)
-    for name, array in vars(splats()).items():
+    for name, array in vars(random_splats()).items():
         found = getattr(again.splats, name)
         if name == "quaternions":
             array, found = normalized(array), normalized(found)
@@ -75,12 +66,14 @@ def test_harmonics_above_the_degree_are_left_out_and_the_rest_is_fitted(ply: Pat
     assert plain.mean < fitted.mean < 60
 
 
-def test_a_limit_on_splats_keeps_those_that_count(ply: Path, tmp_path: Path) -> None:
+def test_a_limit_on_splats_keeps_those_that_count(
+    ply: Path, tmp_path: Path, random_splats: Callable[..., SplatArrays]
+) -> None:
     done = export(ply, tmp_path / "b.ply", max_splats=20, refine=0)
     kept = read_ply(tmp_path / "b.ply")
     assert len(kept) == done.splats == 20 and done.dropped == 40
     # All are of one size and in one place: the opaque ones count.
-    assert kept.opacity_logits.mean() > np.median(splats().opacity_logits)
+    assert kept.opacity_logits.mean() > np.median(random_splats().opacity_logits)
 
 
 @pytest.mark.parametrize("kind", ["ply", "spz"])
@@ -108,10 +101,10 @@ def test_a_limit_on_bytes_is_kept_and_used(ply: Path, tmp_path: Path, kind: str)
     ],
 )
 def test_degrees_are_lowered_before_splats_are_left_out(
-    tmp_path: Path, limit: int | None, degree: int, kept: int
+    tmp_path: Path, limit: int | None, degree: int, kept: int, random_splats: Callable[..., SplatArrays]
 ) -> None:
     source = tmp_path / "a.ply"
-    source.write_bytes(encoded(splats(degree=3), "ply"))
+    source.write_bytes(encoded(random_splats(degree=3), "ply"))
     done = export(source, tmp_path / "b.ply", max_bytes=limit, refine=0)
     assert done.degree == degree and done.splats is not None and abs(done.splats - kept) <= 1
     assert limit is None or done.bytes <= limit
@@ -161,17 +154,19 @@ def test_what_cannot_be_written_is_refused_before_anything_is_read(tmp_path: Pat
         export(nowhere, tmp_path / "c.ply")
 
 
-def test_places_in_the_world_are_kept_where_the_format_can(tmp_path: Path) -> None:
+def test_places_in_the_world_are_kept_where_the_format_can(
+    tmp_path: Path, random_splats: Callable[..., SplatArrays]
+) -> None:
     source = tmp_path / "a.glb"
     offset = (4.2e6, 5e5, -20.0)
-    source.write_bytes(encoded(replace(splats(), world_offset=offset), "glb"))
+    source.write_bytes(encoded(replace(random_splats(), world_offset=offset), "glb"))
     assert export(source, tmp_path / "b.glb").origin == (0.0, 0.0, 0.0)
     assert open_scene(tmp_path / "b.glb").world_offset == offset
     for kind in ("spz", "sog"):
         done = export(source, tmp_path / f"b.{kind}")
         assert done.origin == offset and done.worst > 25
     export(source, tmp_path / "b.ply")
-    expected = splats().means + np.array(offset)
+    expected = random_splats().means + np.array(offset)
     assert np.array_equal(read_ply(tmp_path / "b.ply").means, expected.astype(np.float32))
 
 
@@ -182,17 +177,19 @@ def test_progress_ends_at_its_total(ply: Path, tmp_path: Path) -> None:
     assert seen == [(i + 1, total) for i in range(total)]
 
 
-def test_without_viewpoints_a_scene_is_looked_at_from_all_around() -> None:
-    model = SplatModel(replace(splats(), world_offset=(1e6, 0.0, 0.0)), (0.0, 0.0, 0.0))
+def test_without_viewpoints_a_scene_is_looked_at_from_all_around(
+    random_splats: Callable[..., SplatArrays],
+) -> None:
+    model = SplatModel(replace(random_splats(), world_offset=(1e6, 0.0, 0.0)), (0.0, 0.0, 0.0))
     cameras = own_cameras(model)
-    middle = np.median(splats().means, 0) + np.array(model.world_offset)
+    middle = np.median(random_splats().means, 0) + np.array(model.world_offset)
     directions = np.stack([camera.center - middle for camera in cameras])
     assert len(cameras) == 8 and np.abs(directions).max() < 10
     assert np.abs(directions.mean(0)[[0, 2]]).max() < 0.2 * np.linalg.norm(directions, axis=1).mean()
 
 
-def test_large_views_are_baked_from_smaller_ones() -> None:
-    camera = own_cameras(SplatModel(splats(), (0.0, 0.0, 0.0)))[0]
+def test_large_views_are_baked_from_smaller_ones(random_splats: Callable[..., SplatArrays]) -> None:
+    camera = own_cameras(SplatModel(random_splats(), (0.0, 0.0, 0.0)))[0]
     large = camera.resized(1600, 1200)
     assert (smaller(large).width, smaller(large).height) == (800, 600)
     assert smaller(large).fx == pytest.approx(large.fx / 2)

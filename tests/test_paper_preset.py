@@ -45,6 +45,7 @@ PUBLISHED = {
     "control.prune_at": (),
     "control.idle_share": 0.0,
     "training.steps": 30_000,
+    "training.views_per_step": 1,
     "training.lmbda": 0.001,
     "training.rate": "elements",
     "training.rate_start": 0.1,

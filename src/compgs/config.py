@@ -155,8 +155,11 @@ class ControlConfig:
 class TrainingConfig:
     """Rate-distortion optimization (Sec. 3.4)."""
 
-    # one view each
+    # updates of the scene, after `views_per_step` views each; all schedules are shares of them
     steps: Annotated[int, Range(1, 10_000_000)] = 30_000
+    # views of a step, of all processes together (torchrun): learning rates go with the root of it and Adam's betas with
+    # its power (`training/optimizers.py`); as many views in all need as many times fewer steps
+    views_per_step: Annotated[int, Range(1, 1024)] = 1
     seed: Annotated[int, Range(0, (1 << 31) - 1)] = 0
     # weight of the rate; 0: the entropy networks learn what the latents cost, these do not care
     lmbda: Annotated[float, Range(0, 100)] = 0.002
@@ -209,8 +212,9 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class SplatConfig:
-    """Plain 3D Gaussian Splatting (`--method 3dgs`; Kerbl et al. 2023), as published; schedules as fractions of its
-    30 000 steps, with floors for short runs (`training/densification.py`).
+    """Plain 3D Gaussian Splatting (`--method 3dgs`; Kerbl et al. 2023), as published.
+
+    Schedules are fractions of its 30 000 steps, with floors for short runs (`training/densification.py`).
     """
 
     # degree of the spherical harmonics at the end

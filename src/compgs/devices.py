@@ -1,6 +1,6 @@
 """Where scenes are drawn: on the CPU by kernels, on CUDA by torch and gsplat, which are loaded for that alone."""
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from compgs.errors import ConfigError
 from compgs.extras import missing, require
@@ -53,6 +53,15 @@ def placed(model: _Scene, device: "Device | None") -> _Scene:
 
     load_gsplat()
     return on_device(model, torch.device(name))  # type: ignore[arg-type, return-value]
+
+
+def drawn(gaussians: Any, camera: Any, settings: Any, device: str) -> Any:
+    """The picture (`RasterResult`) of `Gaussians` of numpy arrays, drawn on another device than the CPU."""
+    import torch
+
+    from compgs.tensors.scenes import drawn_gaussians
+
+    return drawn_gaussians(gaussians, camera, settings, torch.device(device))
 
 
 def device_name(device: str) -> str:

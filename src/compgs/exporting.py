@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING
 from compgs import metrics
 from compgs.cameras import Camera
 from compgs.devices import chosen_device
-from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
+from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError, SplatFileError
 from compgs.evaluation.camera_path import between, surround
 from compgs.evaluation.importance import splat_importance
-from compgs.formats import WRITERS, SplatArrays, format_of, open_scene, spz
+from compgs.formats import WRITERS, SplatArrays, format_of, open_scene, scene_file, spz
 from compgs.formats.baking import Baked, bake
 from compgs.formats.refining import refine as refine_splats
 from compgs.formats.registry import KEEP_WORLD_OFFSET
+from compgs.formats.tiled_scene import TiledScene
 from compgs.model.degrees import MAX_DEGREE
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
@@ -107,6 +108,16 @@ def export(
     write = functools.partial(spz.encoded, version=spz_version) if kind == "spz" else WRITERS[kind]
     chosen = chosen_device(device)
     model = open_scene(source, chosen)
+    if isinstance(model, TiledScene):
+        tile = scene_file(source).parent / model.manifest.tiles[0].file
+        raise ConfigError(
+            f"{source}: tiles are exported one by one, as {tile}: together they may not fit in memory"
+        )
+    if not isinstance(model, HybridModel | SplatModel):
+        raise SplatFileError(
+            f"{source}: its splats are made anew for each camera, by networks that no other format holds; it can be "
+            "rendered, compared and evaluated as it is"
+        )
     cameras = own_cameras(model)
     fitted = [smaller(c) for c in (*cameras, *between(cameras, max(0, FITTED_CAMERAS - len(cameras))))]
     compared = (*cameras, *between(cameras, COMPARED_CAMERAS, seed=1))

@@ -92,7 +92,9 @@ class TrainedModel(nn.Module):
     local frame, without the offset: single precision holds it also far from the world's origin.
 
     Embeddings are kept in units of their quantization step, so that a learning rate is a number of steps; log scales
-    in natural units relative to the voxel size.
+    in natural units relative to the voxel size, because their steps are learned: in steps, all primitives would change
+    their size whenever a step does. All else (entropy models, files) sees latents in steps: log scales pass from one to
+    the other in `quantized` and `primitives`.
     """
 
     coordinates: Tensor  # [N, 3] int32, voxels
@@ -155,6 +157,11 @@ class TrainedModel(nn.Module):
     def device(self) -> torch.device:
         return self.log_scales.device
 
+    def slots(self, rows: Tensor) -> Tensor:
+        """[V * K] int64: where the coupled primitives of the anchors in `rows` [V] stand among those of all."""
+        k = self.dimensions.coupled_primitives
+        return (rows[:, None] * k + torch.arange(k, device=rows.device)).view(-1)
+
     def positions(self, rows: Tensor | None = None) -> Tensor:
         """[N, 3] float32 world units in the local frame, of the given anchors or all."""
         coordinates = self.coordinates if rows is None else self.coordinates[rows]
@@ -164,6 +171,19 @@ class TrainedModel(nn.Module):
     def anchor_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that have a row for each anchor."""
         return ("log_scales", "references", *self.residual_kind.anchor_parameters)
+
+    def grown(self, coordinates: Tensor, references: Tensor, log_scale: Tensor) -> dict[str, Tensor]:
+        """Rows of new anchors by name: at coordinates [A, 3] int32, with references [A, reference_dim] and the
+        logarithm [A] of their sizes in voxels.
+        """
+        new = len(coordinates)
+        return {
+            "coordinates": coordinates,
+            "references": references,
+            "log_scales": log_scale[:, None].repeat(1, 6),
+            "residuals": self.entropy.starting_residuals().repeat(new, 1),
+            "mask": self.mask.new_ones(new, self.mask.shape[1]),
+        }
 
     def readers(self) -> Iterator[Reader]:
         """The layers that take the references."""

@@ -1,12 +1,12 @@
 """`compgs serve`: what is wrong with its arguments, and that it serves until it is stopped."""
 
 import http.client
-import os
 import re
 import signal
 import socket
 import subprocess
-import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -27,15 +27,11 @@ def test_a_port_that_is_taken_is_named(tmp_path: Path, capsys: pytest.CaptureFix
     assert f"--port {port}: cannot be listened at" in message and "--port 0" in message
 
 
-def test_it_serves_its_folder_until_it_is_stopped(tmp_path: Path) -> None:
+def test_it_serves_its_folder_until_it_is_stopped(
+    tmp_path: Path, serving: Callable[..., AbstractContextManager[subprocess.Popen[str]]]
+) -> None:
     (tmp_path / "scene.cgs").write_bytes(b"bytes")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "compgs", "serve", str(tmp_path), "--port", "0"],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )
-    try:
+    with serving("serve", str(tmp_path)) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         found = re.fullmatch(r"1 file: http://127\.0\.0\.1:(\d+)/\n", line)
@@ -45,6 +41,3 @@ def test_it_serves_its_folder_until_it_is_stopped(tmp_path: Path) -> None:
         assert connection.getresponse().read() == b"bytes"
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
-    finally:
-        process.kill()
-        process.wait()

@@ -112,3 +112,18 @@ def test_help_can_be_read_where_only_ascii_can_be_shown(arguments: list[str]) ->
     code, out, err = in_a_pipe(*arguments, locale=ASCII)
     assert (code, err) == (0, "")
     assert out.isascii() and "\\u" not in out and "\\x" not in out
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["info", str(GOLDEN_FILE)]])
+def test_who_reads_only_the_beginning_sees_no_traceback(arguments: list[str]) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "compgs", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=environment(UTF8),
+    )
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    assert process.wait() == 1
+    process.stderr.close()

@@ -1,12 +1,13 @@
 """`compgs view`: what is wrong with its arguments, and that it serves until it is stopped."""
 
 import http.client
-import os
 import re
 import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -52,15 +53,10 @@ def test_a_damaged_file_is_one_clear_line(tiny_cgs: Path, capsys: pytest.Capture
     assert capsys.readouterr().err.endswith("; download or copy the file again\n")
 
 
-def test_it_serves_a_page_until_it_is_stopped_and_says_no_more_than_where(tiny_cgs: Path) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "compgs", "view", str(tiny_cgs), "--port", "0"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )
-    try:
+def test_it_serves_a_page_until_it_is_stopped_and_says_no_more_than_where(
+    tiny_cgs: Path, serving: Callable[..., AbstractContextManager[subprocess.Popen[str]]]
+) -> None:
+    with serving("view", str(tiny_cgs)) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         found = re.fullmatch(r".*tiny\.cgs: http://127\.0\.0\.1:(\d+)/\n", line)
@@ -72,6 +68,3 @@ def test_it_serves_a_page_until_it_is_stopped_and_says_no_more_than_where(tiny_c
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
         assert (process.returncode, out, err) == (0, "ended\n", "")
-    finally:
-        process.kill()
-        process.wait()

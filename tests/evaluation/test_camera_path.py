@@ -109,6 +109,20 @@ def test_cameras_between_others_look_as_their_neighbours_do() -> None:
     assert np.median(distances) > 0.1 * step  # they are not those that were there
 
 
+def test_cameras_between_two_that_are_turned_by_little_less_and_more_than_half_a_turn_are_turned_by_half() -> (
+    None
+):
+    # Their quaternions have opposite signs, the mean of which would be no turn at all.
+    def turned(degrees: float) -> Camera:
+        angle = np.deg2rad(degrees)
+        pose = np.eye(4)
+        pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        return Camera(pose, 10.0, 10.0, 4.0, 4.0, 8, 8)
+
+    for camera in between([turned(179), turned(181)], 6):
+        np.testing.assert_allclose(camera.rotation, turned(180).rotation, atol=np.deg2rad(1))
+
+
 def test_cameras_between_are_the_same_every_time_and_others_for_another_seed() -> None:
     ring = [camera for _, camera in orbit(np.eye(3), frames=5, width=8, height=8)]
     poses = [np.stack([c.world_to_camera for c in between(ring, 6, seed=seed)]) for seed in (0, 0, 1)]

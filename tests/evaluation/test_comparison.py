@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,18 +43,6 @@ def wall(level: int) -> SplatArrays:
         opacity_logits=np.array([20.0]),
         dc=np.full((1, 3), (level / 255 - 0.5) / Y0),
         rest=np.zeros((1, 0, 3)),
-    ).each(np.float32)
-
-
-def cloud(count: int = 60) -> SplatArrays:
-    chance = np.random.default_rng(0)
-    return SplatArrays(
-        means=chance.random((count, 3)),
-        log_scales=np.full((count, 3), -2.5),
-        quaternions=chance.normal(size=(count, 4)),
-        opacity_logits=np.linspace(-3, 3, count),
-        dc=chance.normal(size=(count, 3)),
-        rest=0.2 * chance.normal(size=(count, 3, 3)),
     ).each(np.float32)
 
 
@@ -98,8 +87,10 @@ def test_a_known_change_gives_the_closed_form(walls: tuple[Path, Path]) -> None:
     assert (found.a.bytes, found.b.bytes) == tuple(path.stat().st_size for path in walls)
 
 
-def test_the_worst_view_is_that_in_which_the_two_differ_most(tmp_path: Path) -> None:
-    for name, splats in (("a", cloud(60)), ("b", cloud(60))):
+def test_the_worst_view_is_that_in_which_the_two_differ_most(
+    tmp_path: Path, random_splats: Callable[..., SplatArrays]
+) -> None:
+    for name, splats in (("a", random_splats(60)), ("b", random_splats(60))):
         splats.dc[:20] += name == "b"
         write_ply(splats, tmp_path / f"{name}.ply")
     found = compare(tmp_path / "a.ply", tmp_path / "b.ply", device="cpu")
@@ -141,14 +132,16 @@ def test_equal_pictures_among_others_count_as_a_hundred_decibels(
 
 
 @pytest.mark.parametrize("kind", ["ply", "spz", "sog", "glb", "splat"])
-def test_every_format_is_compared_with_every_other(kind: str, tmp_path: Path, tiny_cgs: Path) -> None:
+def test_every_format_is_compared_with_every_other(
+    kind: str, tmp_path: Path, tiny_cgs: Path, random_splats: Callable[..., SplatArrays]
+) -> None:
     other = tmp_path / f"other.{kind}"
     if kind == "splat":
         record = np.zeros(50, ROW)
         record["scale"], record["color"], record["rotation"] = 0.05, 200, (255, 128, 128, 128)
         other.write_bytes(record.tobytes())
     else:
-        other.write_bytes(encoded(cloud(), kind))
+        other.write_bytes(encoded(random_splats(), kind))
     found = compare(tiny_cgs, other, device="cpu")
     assert (found.a.format, found.b.format) == ("cgs", kind)
     assert found.b.primitives == found.b.splats == (50 if kind == "splat" else 60)
@@ -158,9 +151,9 @@ def test_every_format_is_compared_with_every_other(kind: str, tmp_path: Path, ti
 
 
 def test_the_cameras_of_the_second_file_serve_where_the_first_keeps_none(
-    tmp_path: Path, tiny_cgs: Path
+    tmp_path: Path, tiny_cgs: Path, random_splats: Callable[..., SplatArrays]
 ) -> None:
-    write_ply(cloud(), tmp_path / "a.ply")
+    write_ply(random_splats(), tmp_path / "a.ply")
     found = compare(tmp_path / "a.ply", tiny_cgs, device="cpu")
     assert found.cameras == "cameras that tiny.cgs keeps"
     alone = compare(tmp_path / "a.ply", tmp_path / "a.ply", device="cpu")
@@ -175,8 +168,10 @@ def test_cameras_are_taken_from_a_file(walls: tuple[Path, Path], tmp_path: Path)
     assert found.cameras == "cameras of cameras.json" and found.a.psnr is None
 
 
-def test_both_are_seen_over_one_background(tmp_path: Path, tiny_cgs: Path) -> None:
-    nothing = cloud()
+def test_both_are_seen_over_one_background(
+    tmp_path: Path, tiny_cgs: Path, random_splats: Callable[..., SplatArrays]
+) -> None:
+    nothing = random_splats()
     write_ply(replace(nothing, means=nothing.means + 1e4), tmp_path / "away.ply")
     own = compgs.decode(tiny_cgs).background
     assert any(own)
@@ -189,10 +184,12 @@ def test_both_are_seen_over_one_background(tmp_path: Path, tiny_cgs: Path) -> No
             assert found.identical
 
 
-def test_positions_that_have_lost_their_origin_are_put_back(tmp_path: Path) -> None:
+def test_positions_that_have_lost_their_origin_are_put_back(
+    tmp_path: Path, random_splats: Callable[..., SplatArrays]
+) -> None:
     origin = (4.0e6, -2.0e5, 17.0)
-    (tmp_path / "far.glb").write_bytes(encoded(replace(cloud(), world_offset=origin), "glb"))
-    (tmp_path / "local.spz").write_bytes(encoded(cloud(), "spz"))
+    (tmp_path / "far.glb").write_bytes(encoded(replace(random_splats(), world_offset=origin), "glb"))
+    (tmp_path / "local.spz").write_bytes(encoded(random_splats(), "spz"))
     for files in (("far.glb", "local.spz"), ("local.spz", "far.glb")):
         found = compare(*(tmp_path / name for name in files), device="cpu")
         assert found.psnr > 25 and found.a.psnr is None
@@ -201,10 +198,12 @@ def test_positions_that_have_lost_their_origin_are_put_back(tmp_path: Path) -> N
         )
 
 
-def test_positions_near_the_origin_stay_where_they_are(tmp_path: Path) -> None:
+def test_positions_near_the_origin_stay_where_they_are(
+    tmp_path: Path, random_splats: Callable[..., SplatArrays]
+) -> None:
     origin = (3.0, 0.0, 0.0)
-    (tmp_path / "a.glb").write_bytes(encoded(replace(cloud(), world_offset=origin), "glb"))
-    write_ply(replace(cloud(), world_offset=origin), tmp_path / "b.ply")
+    (tmp_path / "a.glb").write_bytes(encoded(replace(random_splats(), world_offset=origin), "glb"))
+    write_ply(replace(random_splats(), world_offset=origin), tmp_path / "b.ply")
     found = compare(tmp_path / "a.glb", tmp_path / "b.ply", device="cpu")
     assert found.notes == () and found.psnr > 60
 
@@ -236,12 +235,15 @@ def test_what_is_written_says_what_was_found(walls: tuple[Path, Path], tmp_path:
 
 
 def test_the_page_shows_the_views_that_differ_most_first(
-    tmp_path: Path, walls: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    walls: tuple[Path, Path],
+    monkeypatch: pytest.MonkeyPatch,
+    random_splats: Callable[..., SplatArrays],
 ) -> None:
     from compgs.evaluation.reports import comparison_page
 
     monkeypatch.setattr(comparison_page, "SHOWN_VIEWS", 2)
-    write_ply(cloud(), tmp_path / "c.ply")
+    write_ply(random_splats(), tmp_path / "c.ply")
     found = compare(tmp_path / "c.ply", walls[1], output=tmp_path / "out", device="cpu")
     page = ParsedPage((tmp_path / "out" / PAGE_NAME).read_bytes())
     ranked = [view.name for view in sorted(found.per_view, key=lambda view: view.psnr)]

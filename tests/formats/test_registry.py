@@ -31,8 +31,8 @@ def contents(made, cgs_bytes: bytes) -> dict[str, bytes]:
 
 
 def test_every_format_is_known_by_its_content_alone(contents: dict[str, bytes], tmp_path: Path) -> None:
-    # (files of methods: tests/methods)
-    assert contents.keys() | {"packed"} == {each.name for each in FORMATS}
+    # (files of methods: tests/methods; folders of tiles: test_tiled.py)
+    assert contents.keys() | {"packed", "tiles"} == {each.name for each in FORMATS}
     for name, content in contents.items():
         for suffix in (".ply", ".cgs", ""):
             path = tmp_path / f"{name}-as{suffix}"

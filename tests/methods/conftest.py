@@ -1,4 +1,7 @@
-"""A method that nobody would publish: masks learned with the splats, then few colors for all of them."""
+"""A method that nobody would publish: masks learned with the splats, then few colors for all of them.
+
+And a check that methods share: that a run may stop anywhere.
+"""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,6 +12,7 @@ import pytest
 import torch
 from torch import nn
 
+from compgs import methods
 from compgs.config import Config, Range
 from compgs.formats import SplatArrays
 from compgs.formats.packed import SUFFIX, Packed, packed_bits, splat_model, unpacked_bits, write_packed
@@ -132,3 +136,29 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Method:
     """That method, registered."""
     monkeypatch.setitem(METHODS, "toy", TOY)
     return TOY
+
+
+@pytest.fixture
+def check_continues(blob_scene: Any, tmp_path: Path) -> Any:
+    """A check that runs of a method, stopped after some steps and continued, end with the same file."""
+
+    def check(method: str, config: Any, stops: tuple[int, ...], splats: SplatModel | None = None) -> None:
+        def trained(name: str, stop: int | None = None, resume: bool = False) -> bytes:
+            def look(status: Any) -> None:
+                if status.step == stop:
+                    raise KeyboardInterrupt
+
+            options = {"output": tmp_path / name, "resume": resume, "on_progress": look, "splats": splats}
+            model = methods.train(blob_scene, config, method=method, device="cpu", **options)
+            path = tmp_path / f"{name}.packed"
+            methods.write(model, path, method=method, config=config)
+            return path.read_bytes()
+
+        whole = trained("whole")
+        assert whole == trained("whole", resume=True), "a finished run gives the same again"
+        for stop in stops:
+            with pytest.raises(KeyboardInterrupt):
+                trained(f"stopped{stop}", stop)
+            assert trained(f"stopped{stop}", resume=True) == whole, stop
+
+    return check

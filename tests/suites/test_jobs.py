@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from compgs.interrupt import Terminated
 from compgs.suites import jobs as jobs_module
 from compgs.suites.jobs import Job, jobs_of, run_job
 from compgs.suites.serial import run_serially
@@ -107,3 +108,29 @@ def _alive(pid: int) -> bool:
         return status.read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+@pytest.mark.parametrize(("stop", "told"), [(KeyboardInterrupt, 0), (Terminated, 1)])
+def test_a_request_to_end_is_passed_on_to_the_run_which_ctrl_c_reaches_by_itself(
+    stop: type[KeyboardInterrupt], told: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    class Process:
+        def __init__(self, *_: object, **__: object) -> None:
+            self.waits = iter([stop(), 0])
+
+        def wait(self) -> int:
+            found = next(self.waits)
+            said.append("wait")
+            if isinstance(found, BaseException):
+                raise found
+            return found
+
+        def terminate(self) -> None:
+            said.append("terminate")
+
+    monkeypatch.setattr(subprocess, "Popen", Process)
+    with pytest.raises(stop):
+        jobs_module._run([], tmp_path / "output.txt")
+    assert said == ["wait", *["terminate"] * told, "wait"]

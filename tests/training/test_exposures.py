@@ -47,7 +47,7 @@ def test_a_known_exposure_of_a_known_image_is_found() -> None:
     for step in range(300):
         view = step % 2
         photometric_loss(image, Target(photographs[view], exposure=exposures.of(view))).backward()
-        exposures.learn(step / 300)
+        exposures.learn(step / 300, [view], exposures.gradients([view]))
     found = exposures.neutral + exposures.change
     for view in range(2):
         difference = exposed(image, found[view]) - exposed(image, truth[view])

@@ -16,6 +16,7 @@ from compgs.cameras import Camera
 from compgs.codec import decode, encode
 from compgs.config import Config
 from compgs.errors import ConfigError, TrainingError
+from compgs.evaluation.camera_path import look_at
 from compgs.gaussians import Gaussians
 from compgs.metrics import psnr, to_8bit
 from compgs.render import RasterSettings, render
@@ -32,15 +33,8 @@ CPU = torch.device("cpu")
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
-def look_at(eye: Sequence[float], target: Sequence[float] = (0, 0, 0)) -> np.ndarray:
-    """World to camera [4, 4], OpenCV axes, world z up."""
-    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ np.asarray(eye, dtype=float)
-    return pose
+def posed(eye: Sequence[float], target: Sequence[float] = (0, 0, 0)) -> np.ndarray:
+    return look_at(np.array(eye, float), np.array(target, float), np.array([0.0, 0.0, 1.0]))
 
 
 def camera(pose: np.ndarray, width: int = 48, height: int = 36) -> Camera:
@@ -51,7 +45,7 @@ def camera(pose: np.ndarray, width: int = 48, height: int = 36) -> Camera:
 def ring(views: int, distance: float = 4.0, width: int = 48, height: int = 36) -> list[Camera]:
     angles = 2 * np.pi * np.arange(views) / views
     return [
-        camera(look_at((distance * np.cos(a), distance * np.sin(a), 0.4 * distance)), width, height)
+        camera(posed((distance * np.cos(a), distance * np.sin(a), 0.4 * distance)), width, height)
         for a in angles
     ]
 
@@ -165,7 +159,7 @@ def strays() -> Scene:
 
 def a_view_of_nothing() -> Scene:
     """One of the photographs shows background alone."""
-    away = camera(look_at((4.0, 0.0, 1.5), (8.0, 0.0, 1.5)))
+    away = camera(posed((4.0, 0.0, 1.5), (8.0, 0.0, 1.5)))
     return photographed(blobs(150, 1.0, 0.12), [away, *ring(11)])
 
 

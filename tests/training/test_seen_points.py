@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from compgs.errors import TrainingError
+from compgs.scene.sight import depths_in
 from compgs.scene.views import Points, Scene
-from compgs.training.seen_points import check_points_seen, depths_in
+from compgs.training.seen_points import check_points_seen
 from compgs.training.splat_trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 

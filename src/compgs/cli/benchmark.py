@@ -1,16 +1,14 @@
 """`compgs benchmark`: a suite of runs, and the paper's tables of them."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from tyro.conf import Positional, UseAppendAction, arg
 
 from compgs.cli.command import NO_DEFAULT, Command
-from compgs.cli.console import console, say
+from compgs.cli.console import say
+from compgs.cli.progress import counting_runs
 from compgs.cli.usage import UsageError, settings_of_options
 
 
@@ -68,7 +66,7 @@ class Benchmark(Command):
             )
         with settings_of_options():
             suite = load_suite(self.suite)
-            with _counting() as progress:
+            with counting_runs("runs") as progress:
                 done = benchmark(
                     suite,
                     self.output,
@@ -88,21 +86,3 @@ class Benchmark(Command):
             )
         if done.failed:
             say(f"{len(done.failed)} of {done.jobs} runs failed; the same command runs them again")
-
-
-@contextmanager
-def _counting() -> Iterator[Callable[[int, int, str], None]]:
-    """A bar, or a line for each run that begins."""
-    if not console.is_terminal:
-        yield lambda done, total, what: say(f"{done} of {total} runs done" + (f"; {what}" if what else ""))
-        return
-    columns = (
-        TextColumn("runs"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.description}"),
-    )
-    with Progress(*columns, console=console) as bars:
-        task = bars.add_task("", total=None)
-        yield lambda done, total, what: bars.update(task, completed=done, total=total, description=what)

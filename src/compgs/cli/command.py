@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.run_folder import SceneSource
+from compgs.cli.sizes import parse_size
 from compgs.cli.usage import UsageError, check_range, settings_of_options
 from compgs.errors import ConfigError
 from compgs.extras import require
@@ -75,6 +76,24 @@ class DecodingCommand(ComputingCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MemoryOption:
+    """How much of a scene in tiles may be open."""
+
+    memory: Annotated[
+        str | None, arg(metavar="SIZE", help_behavior_hint="(default: half of the machine's)")
+    ] = None
+    """Of a scene in tiles, the memory that open tiles may take, such as 500MB or 2GB; others are opened again when they
+    are in view. The pictures are the same."""
+
+    def allow_memory(self) -> None:
+        """Raises UsageError for what is no size."""
+        if self.memory is not None:
+            from compgs.formats.tiled_scene import ASKED_BY
+
+            os.environ[ASKED_BY] = str(parse_size(self.memory, "--memory"))
+
+
+@dataclass(frozen=True, kw_only=True)
 class FileArgument:
     """Which file."""
 
@@ -95,8 +114,8 @@ class SceneFileOrRunArgument:
     """Which file; one that a run has left brings its scene along."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE|RUN")]
-    """A .cgs file, or splats: .ply as 3DGS writes it, .spz, .sog (or its meta.json), .glb, .splat; or the folder of a
-    run, for its file, and its scene read as in training."""
+    """A .cgs file, the manifest.json of a scene in tiles, or splats: .ply as 3DGS writes it, .spz, .sog (or its
+    meta.json), .glb, .splat; or the folder of a run, for its file, and its scene read as in training."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, ReadingOptions
+from compgs.cli.command import NO_DEFAULT, ComputingCommand, MemoryOption, ReadingOptions
 from compgs.cli.console import print_comparison, say
 from compgs.cli.progress import counting
 from compgs.cli.scenes import read_scene
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(ComputingCommand, ReadingOptions):
+class Compare(ComputingCommand, ReadingOptions, MemoryOption):
     """Compare two files of one scene, of any format: bytes, primitives, and what both look like from the same cameras.
 
     With --scene both are compared with the held-out photographs, too; give -r and the like as in training. Without,
@@ -35,7 +35,8 @@ class Compare(ComputingCommand, ReadingOptions):
     """
 
     a: Annotated[Positional[Path], arg(metavar="A")]
-    """A .cgs file, or splats: .ply as 3DGS writes it, .spz, .sog (or its meta.json), .glb, .splat."""
+    """A .cgs file, the manifest.json of a scene in tiles, or splats: .ply as 3DGS writes it, .spz, .sog (or its
+    meta.json), .glb, .splat."""
 
     b: Annotated[Positional[Path], arg(metavar="B")]
     """Another one."""
@@ -58,6 +59,7 @@ class Compare(ComputingCommand, ReadingOptions):
         self.check_reading()
         if self.scene is not None and self.cameras is not None:
             raise UsageError("--scene and --cameras were both given; give one")
+        self.allow_memory()
         from compgs.formats import check_scene
 
         for file in (self.a, self.b):

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from compgs.evaluation.comparison import Comparison
     from compgs.evaluation.reduction import Reduction
     from compgs.evaluation.results import Results
+    from compgs.formats.tiled import TileEntry
 
 console = Console(highlight=False, soft_wrap=True)
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -71,6 +72,17 @@ def print_ranges(ranges: "Sequence[RangeInfo]") -> None:
         table.add_column(heading, justify="right")
     for part in ranges:
         table.add_row(f"{part.level}", f"{part.anchors:,}", f"{part.bytes:,}")
+    console.print(table)
+
+
+def print_tiles(tiles: "Sequence[TileEntry]") -> None:
+    """What each tile of a scene has and takes."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("tile", "anchors", "coupled primitives", "bytes", "memory when open"):
+        table.add_column(heading, justify="left" if heading == "tile" else "right")
+    for tile in tiles:
+        counts = (tile.anchors, tile.coupled_primitives, tile.bytes)
+        table.add_row(tile.name, *(f"{count:,}" for count in counts), size(tile.memory))
     console.print(table)
 
 

@@ -9,8 +9,9 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from compgs.cli.command import NO_DEFAULT, DecodingCommand, FileArgument
 from compgs.cli.console import duration, say, size
-from compgs.cli.inputs import check_bitstream
+from compgs.cli.inputs import check_bitstream, tiles_manifest
 from compgs.cli.prefixes import parse_prefix
+from compgs.cli.usage import UsageError
 from compgs.numerics.compiling import working_seconds
 from compgs.outputs import check_output_folder, write_bytes
 
@@ -47,24 +48,49 @@ class Decode(DecodingCommand, FileArgument):
     """Replace what is in FOLDER already."""
 
     def run(self) -> None:
+        if manifest := tiles_manifest(self.file):
+            self.decode_tiles(manifest)
+            return
         if self.prefix is None:
             check_bitstream(self.file)
         prefix = None if self.prefix is None else parse_prefix(self.prefix, self.file)
         if self.output is not None:
             check_output_folder(self.output, overwrite=self.overwrite)
         self.prepare("decode")
+        self.decode(self.file, self.output, prefix)
+
+    def decode_tiles(self, manifest: Path) -> None:
+        """Raises UsageError, BitstreamError, OutputError."""
+        if self.prefix is not None:
+            raise UsageError(
+                f"--prefix {self.prefix}: {manifest} is of a scene in tiles; give the file of one"
+            )
+        from compgs.formats import check_scene
+        from compgs.formats.tiled import read_manifest, tile_bytes
+
+        check_scene(manifest)
+        if self.output is not None:
+            check_output_folder(self.output, overwrite=self.overwrite)
+        self.prepare("decode")
+        for tile in read_manifest(manifest).tiles:
+            tile_bytes(manifest.parent, tile)  # it is the promised one
+            output = None if self.output is None else self.output / tile.name
+            self.decode(manifest.parent / tile.file, output, None)
+
+    def decode(self, file: Path, output: Path | None, prefix: int | None) -> None:
+        """One file, and what it holds to a folder. Raises BitstreamError, OutputError."""
         from compgs.codec import decode
 
         start = working_seconds()
-        model = decode(self.file, self.device, prefix=prefix)
+        model = decode(file, self.device, prefix=prefix)
         seconds = working_seconds() - start
-        taken = self.file.stat().st_size if prefix is None else min(prefix, self.file.stat().st_size)
+        taken = file.stat().st_size if prefix is None else min(prefix, file.stat().st_size)
         part = "" if prefix is None else "first "
         say(
-            f"{self.file}: {part}{size(taken)}, {model.anchors:,} anchors, "
+            f"{file}: {part}{size(taken)}, {model.anchors:,} anchors, "
             f"{model.coupled:,} coupled primitives, decoded in {duration(seconds)}"
         )
-        if self.output is None:
+        if output is None:
             return
         import numpy as np
 
@@ -90,5 +116,5 @@ class Decode(DecodingCommand, FileArgument):
         for name, arrays in contents.items():
             buffer = io.BytesIO()
             np.savez(buffer, **arrays)
-            write_bytes(self.output / name, buffer.getvalue())
-            say(f"{self.output / name}: {size(buffer.tell())}")
+            write_bytes(output / name, buffer.getvalue())
+            say(f"{output / name}: {size(buffer.tell())}")

@@ -11,9 +11,10 @@ from compgs.cli.command import DecodingCommand, ReadingOptions, allow_tmc3
 from compgs.cli.console import duration, print_components, print_reduction, say, size
 from compgs.cli.inputs import check_bitstream, read_bitstream
 from compgs.cli.progress import counting
-from compgs.cli.run_folder import CHECKPOINT_NAME, SceneSource, file_name, load_settings
+from compgs.cli.run_folder import CHECKPOINT_NAME, SETTINGS_NAME, SceneSource, file_name, load_settings
 from compgs.cli.scenes import read_scene
 from compgs.cli.sizes import parse_cameras
+from compgs.cli.tiles import cut
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.errors import CheckpointError
 from compgs.outputs import check_output_file, write_bytes
@@ -138,7 +139,10 @@ class Encode(DecodingCommand, ReadingOptions):
         from compgs.training import load_run
 
         viewpoints = None if self.cameras is None else parse_cameras(self.cameras)
-        return encoded(load_run(self.source), self.geometry, viewpoints=viewpoints)[0]
+        model = load_run(self.source)
+        if (self.source / SETTINGS_NAME).is_file():  # a run that began in Python has none, and is of no tile
+            cut(model, load_settings(self.source))
+        return encoded(model, self.geometry, viewpoints=viewpoints)[0]
 
     def reduced(self, data: bytes) -> bytes:
         from compgs.evaluation.reduction import reduce_file

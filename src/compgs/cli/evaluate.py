@@ -6,7 +6,14 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileOrRunArgument, SceneOptions, check_lpips
+from compgs.cli.command import (
+    NO_DEFAULT,
+    DecodingCommand,
+    MemoryOption,
+    SceneFileOrRunArgument,
+    SceneOptions,
+    check_lpips,
+)
 from compgs.cli.console import print_results, say, warn
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import file_and_run, read_otherwise
@@ -15,7 +22,7 @@ from compgs.outputs import check_output_folder
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
+class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption):
     """Decode a file, render a scene's held-out views from it and compare them with the photographs.
 
     Give -r, --images, --test-every and --background as in training: the views held out there are the ones to
@@ -50,6 +57,7 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
     def run(self) -> None:
         from compgs.formats import check_scene
 
+        self.allow_memory()
         file, run = file_and_run(self.file)
         check_scene(file)
         if self.output is not None:

@@ -15,6 +15,16 @@ def check_bitstream(path: Path) -> None:
         unpack(data)
 
 
+def tiles_manifest(path: Path) -> Path | None:
+    """The manifest, where the path is one, or a folder of tiles, or of a run in tiles. Raises NotACompGSFile."""
+    from compgs.cli.run_folder import manifest_of
+    from compgs.formats import format_of, scene_file
+
+    of_run = manifest_of(path)
+    file = of_run if path.is_dir() and of_run.is_file() else scene_file(path)
+    return file if file.is_file() and format_of(file).name == "tiles" else None
+
+
 def read_bitstream(path: Path) -> bytes:
     """The bytes of a .cgs file. Raises NotACompGSFile."""
     from compgs.formats import format_of

@@ -4,6 +4,7 @@ Exit codes: 0 done; 1 something is wrong with the input, the output or the file;
 understood, or has a value that is out of range; 130 stopped by the user (Ctrl-C), 143 by the system (SIGTERM).
 """
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -77,6 +78,18 @@ def parse(words: Sequence[str]) -> Command:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code."""
+    try:
+        code = dispatched(arguments)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        # Python writes what is left when it ends, which would fail again, with a traceback.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def dispatched(arguments: Sequence[str] | None = None) -> int:
+    """The exit code. Raises BrokenPipeError when nobody reads on."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     show_whatever_can_be_shown()
     if given in (["--version"], ["-V"]):
@@ -100,6 +113,8 @@ def run(command: Command) -> int:
     try:
         with ended_on_request():
             command.run()
+    except BrokenPipeError:
+        raise
     except (CompGSError, OSError, MemoryError) as error:
         if command.debug:
             raise

@@ -10,6 +10,7 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     TextColumn,
+    TimeElapsedColumn,
     TimeRemainingColumn,
 )
 
@@ -32,6 +33,24 @@ def counting(what: str) -> Iterator[Callable[[int, int], None]]:
     with Progress(*columns, console=console, transient=True) as bars:
         task = bars.add_task(what, total=None)
         yield lambda done, total: bars.update(task, completed=done, total=total)
+
+
+@contextmanager
+def counting_runs(runs: str) -> Iterator[Callable[[int, int, str], None]]:
+    """Yields `progress(done, total, what)`: a bar, or a line for each of the `runs` (a word) that begins."""
+    if not console.is_terminal:
+        yield lambda done, total, what: say(f"{done} of {total} {runs} done" + (f"; {what}" if what else ""))
+        return
+    columns = (
+        TextColumn(runs),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+    )
+    with Progress(*columns, console=console) as bars:
+        task = bars.add_task("", total=None)
+        yield lambda done, total, what: bars.update(task, completed=done, total=total, description=what)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileOrRunArgument, SceneOptions
+from compgs.cli.command import NO_DEFAULT, DecodingCommand, MemoryOption, SceneFileOrRunArgument, SceneOptions
 from compgs.cli.console import duration, say
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import RunSettings, SceneSource, file_and_run
@@ -31,7 +31,7 @@ VIDEO_BYTES = 16 << 20  # that must be free for a video; a long one fails later
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
+class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption):
     """Render images or a video from a file of splats: views of a scene, cameras of a JSON file, or a way through it.
 
     A camera file is a list of objects with world_to_camera (4 x 4, OpenCV axes), fx, fy, cx, cy, width and
@@ -102,6 +102,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument):
         self.check_values()
         from compgs.formats import check_scene, open_scene
 
+        self.allow_memory()
         file, run = file_and_run(self.file)
         check_scene(file)
         self.check_output()

@@ -34,7 +34,7 @@ class Report(Command):
     """The page to write."""
 
     title: str = "Report"
-    """Of the page."""
+    """Title of the page."""
 
     reference: Annotated[
         str | None, arg(metavar="METHOD", help_behavior_hint="(default: the first curve)")

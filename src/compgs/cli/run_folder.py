@@ -40,11 +40,20 @@ class RunSettings:
     config: Config
     method: str = "compgs"
     splats: str | None = None  # file of splats that the run began with
+    tiles: str | None = None  # columns x rows, of a run that trains its capture in tiles
+    tile: dict[str, Any] | None = None  # of the run of one tile: what of the plan it needs (`tile_entry`)
 
 
 def file_name(folder: Path, extension: str = ".cgs") -> str:
     """The file of a run is named after its folder."""
     return f"{folder.absolute().name}{extension}"
+
+
+def manifest_of(folder: Path) -> Path:
+    """Where a run that trains its capture in tiles describes them."""
+    from compgs.formats.tiled import MANIFEST, SUFFIX
+
+    return folder / file_name(folder, SUFFIX) / MANIFEST
 
 
 def save_settings(folder: Path, settings: RunSettings) -> None:
@@ -56,6 +65,8 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
         "scene": asdict(settings.scene),
         "settings": settings.config.to_dict(),
         **({"from_splats": settings.splats} if settings.splats is not None else {}),
+        **({"tiles": settings.tiles} if settings.tiles is not None else {}),
+        **({"tile": settings.tile} if settings.tile is not None else {}),
     }
     write_json(folder / SETTINGS_NAME, content)
 
@@ -120,7 +131,8 @@ def _made_by_runs(folder: Path) -> list[Path]:
     """The checkpoint, and what is made of it in the end."""
     names = [CHECKPOINT_NAME, TRAINING_NAME, "results.json", "per_view.json"]
     suffixes = sorted({method.suffix for method in METHODS.values()})
-    return [folder / name for name in names + [file_name(folder, suffix) for suffix in suffixes]]
+    files = [file_name(folder, suffix) for suffix in suffixes]
+    return [*(folder / name for name in names + files), manifest_of(folder)]
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -164,6 +176,8 @@ def run_settings(content: dict[str, Any], place: str) -> RunSettings:
         config=config_from_dict(content["settings"], place, METHODS[method].settings),
         method=method,
         splats=content.get("from_splats"),
+        tiles=_given(content, "tiles", str),
+        tile=_given(content, "tile", dict),
     )
 
 
@@ -174,7 +188,9 @@ def file_and_run(path: Path) -> tuple[Path, RunSettings | None]:
     """
     folder = path if path.is_dir() else path.parent
     if not (folder / SETTINGS_NAME).is_file():
-        return path, None
+        from compgs.formats import scene_file
+
+        return scene_file(path), None
     if not path.is_dir():
         with suppress(CheckpointError):
             settings = load_settings(folder)
@@ -192,6 +208,8 @@ def file_and_run(path: Path) -> tuple[Path, RunSettings | None]:
 
 
 def _written_by(folder: Path, settings: RunSettings) -> Path:
+    if settings.tiles is not None:
+        return manifest_of(folder)
     return folder / file_name(folder, METHODS[settings.method].suffix)
 
 
@@ -210,6 +228,14 @@ def _as_typed(value: Any) -> str:
     if value is None:
         return "not given"
     return " ".join(f"{part:g}" for part in value) if isinstance(value, tuple) else str(value)
+
+
+def _given(content: dict[str, Any], name: str, kind: type) -> Any:
+    """None where there is none. Raises ValueError for another type."""
+    value = content.get(name)
+    if value is not None and not isinstance(value, kind):
+        raise ValueError(f"{name} is {value!r:.80}")
+    return value
 
 
 def _known_method(name: str) -> str:

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from compgs.scene import Scene
 
 
-def read_scene(source: SceneSource) -> "Scene":
-    """Raises SceneError."""
+def read_scene(source: SceneSource, *, at_once: bool = True) -> "Scene":
+    """`at_once`: photographs that fit into memory are decoded now. Raises SceneError."""
     from compgs.scene import load_scene
 
     with counting("reading views") as progress:
@@ -24,6 +24,7 @@ def read_scene(source: SceneSource) -> "Scene":
             holdout=source.holdout,
             background=source.background,
             progress=progress,
+            at_once=at_once,
         )
     first = (scene.train_views or scene.test_views)[0].camera
     say(

@@ -11,10 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, SceneOptions, check_lpips, one_scene
+from compgs.cli.command import (
+    NO_DEFAULT,
+    ComputingCommand,
+    SceneOptions,
+    check_lpips,
+    one_scene,
+    use_threads,
+)
 from compgs.cli.console import duration, print_profile, print_results, say, size
 from compgs.cli.offer import with_poses
 from compgs.cli.progress import counting, training
+from compgs.cli.ranks import among_ranks, several, share_of_threads
 from compgs.cli.run_folder import (
     CHECKPOINT_NAME,
     TRAINING_NAME,
@@ -28,6 +36,7 @@ from compgs.cli.run_folder import (
 from compgs.cli.scenes import read_scene
 from compgs.cli.settings import check_settings_of, with_settings
 from compgs.cli.sizes import parse_cameras, parse_size
+from compgs.cli.tiles import block, check_options, cut, settings_of_tile, train_tiles
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.cli.viewing import check_viewing, viewing
 from compgs.errors import MissingSparseModel
@@ -51,8 +60,8 @@ NOTABLE_MISS = 0.05  # of the size that was asked for
 class Train(ComputingCommand, SceneOptions):
     """Train a scene, write its file, decode the file and compare it with the held-out views.
 
-    The file is a .cgs. With --method the scene is trained by another method, and the file is that method's: of 3dgs,
-    plain 3D Gaussian Splatting without any compression, a .ply: what compression is to be compared with.
+    The file is a .cgs. With --method the scene is trained by another method, and the file is that method's: with 3dgs
+    a .ply of plain, uncompressed 3D Gaussian Splatting, which compression is compared with.
 
     The run's folder then holds the file, results.json, per_view.json, config.json, the renders beside the
     photographs (test/renders, test/gt, contact_sheet.png) and a checkpoint.
@@ -73,7 +82,11 @@ class Train(ComputingCommand, SceneOptions):
 
     compgs train scenes/garden -o runs/garden --viewer
 
+    compgs train scenes/city -o runs/city --tiles 4x3
+
     compgs train -o runs/garden --resume
+
+    torchrun --nproc-per-node 8 -m compgs train scenes/garden -o runs/eight --set training.views_per_step=8 --steps 3750
     """
 
     output: Annotated[
@@ -111,7 +124,7 @@ class Train(ComputingCommand, SceneOptions):
     steps: Annotated[
         int | None, arg(aliases=["--iterations"], metavar="N", help_behavior_hint="(default: the preset's)")
     ] = None
-    """Training steps, one view each; all schedules scale with it."""
+    """Training steps, one view each (--set training.views_per_step: more); all schedules scale with it."""
 
     seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
     """Of every random choice: the same seed on the same CPU gives the same file."""
@@ -146,6 +159,22 @@ class Train(ComputingCommand, SceneOptions):
     viewer_port: Annotated[int, arg(metavar="N")] = 8080
     """Port at which it listens; 0 takes a free one."""
 
+    tiles: Annotated[str | None, arg(metavar="auto|NxM", help_behavior_hint=NO_DEFAULT)] = None
+    """Divide the capture on the ground, N tiles along it and M across, and train one after the other, for scenes larger
+    than memory. RUN then has RUN.tiles, a folder with a file for each tile."""
+
+    tile: Annotated[str | None, arg(metavar="PLAN#NAME", help_behavior_hint=NO_DEFAULT)] = None
+    """Train one tile of the plan.json that --tiles left in its RUN; what --tiles itself does for each."""
+
+    cluster: Annotated[str | None, arg(metavar="ADDRESS|local", help_behavior_hint=NO_DEFAULT)] = None
+    """Train tiles on a Ray cluster, or several at once on this machine (`local`). Needs the extra `cluster`."""
+
+    cpus: Annotated[float, arg(metavar="N")] = 1.0
+    """CPU cores that a tile takes on a cluster."""
+
+    gpus: Annotated[float, arg(metavar="N")] = 0.0
+    """GPUs that a tile takes on a cluster."""
+
     def run(self) -> None:
         if self.output is None:
             raise UsageError(
@@ -155,26 +184,41 @@ class Train(ComputingCommand, SceneOptions):
             raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
         require("train", "training")
         folder = self.output
-        check_output_folder(folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES)
-        settings = self.settings(folder)
-        self.prepare_training("train", "encode", "decode", "render")
-        if self.lpips:
-            check_lpips()
-        if self.viewer:
-            check_viewing(self.viewer_port, "--viewer-port")
-        if self.resume:
-            say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
-        scene, settings = self.read(settings)
-        with (
-            self.viewing(scene, folder.name) as viewing,
-            beginning(folder, settings, anew=not self.resume) as earlier,
-        ):
-            model = self.train(scene, settings, folder, earlier, viewing)
+        with among_ranks(self.device) as leads:
+            if leads:
+                check_output_folder(
+                    folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES
+                )
+            settings = self.settings(folder)
+            if settings.tiles is not None:
+                train_tiles(self, settings)
+                return
+            self.prepare_training("train", "encode", "decode", "render")
+            if several() and self.threads is None:
+                use_threads(share_of_threads())
+            if self.lpips:
+                check_lpips()
+            if self.viewer and leads:
+                check_viewing(self.viewer_port, "--viewer-port")
+            if self.resume:
+                say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
+            scene, settings = self.read(settings)
+            if not leads:
+                self.train(scene, settings, folder, None, None)
+                return
+            with (
+                self.viewing(scene, folder.name) as viewing,
+                beginning(folder, settings, anew=not self.resume) as earlier,
+            ):
+                model = self.train(scene, settings, folder, earlier, viewing)
+        cut(model, settings)
         method = METHODS[settings.method]
         path = folder / file_name(folder, method.suffix)
         start = time.perf_counter()
         written = method.write(model, path, settings.config)
         say(f"{path}: {size(written)}, written in {duration(time.perf_counter() - start)}")
+        if settings.tile is not None:
+            return  # tiles are evaluated together
         self.evaluate(scene, path, folder, settings)
         if settings.config.training.target_bytes is not None:
             say_miss(folder, settings.config.training.target_bytes)
@@ -192,12 +236,15 @@ class Train(ComputingCommand, SceneOptions):
     def read(self, settings: RunSettings) -> tuple["Scene", RunSettings]:
         """The scene; where there are photographs without poses, of those that are found if the user agrees."""
         try:
-            return read_scene(settings.scene), settings
+            # Of several processes, and for several tiles, each reads the photographs of its own views, when it comes
+            # to them.
+            at_once = not several() and settings.tiles is None and settings.tile is None
+            return block(read_scene(settings.scene, at_once=at_once), settings), settings
         except MissingSparseModel:
-            found = None if self.resume else with_poses(settings.scene)
+            found = None if self.resume or several() else with_poses(settings.scene)
             if found is None:
                 raise
-        return read_scene(found), replace(settings, scene=found)
+        return read_scene(found, at_once=settings.tiles is None), replace(settings, scene=found)
 
     def continues(self, folder: Path) -> bool:
         """There is a checkpoint to go on from, and it is asked for."""
@@ -205,6 +252,9 @@ class Train(ComputingCommand, SceneOptions):
 
     def settings(self, folder: Path) -> RunSettings:
         """From the command line, or of the run to be continued. Raises UsageError, CheckpointError."""
+        check_options(self)
+        if self.tile is not None and not self.resume:
+            return settings_of_tile(self.tile)
         if not self.resume:
             preset, method = self.preset or "default", self.method or "compgs"
             source = self.scene_source(holdout=self.eval)
@@ -216,7 +266,7 @@ class Train(ComputingCommand, SceneOptions):
                 start = settings_of(method, preset)
             config = with_settings(start, self.assignments())
             splats = None if self.from_splats is None else str(self.from_splats)
-            return RunSettings(preset, source, config, method, splats)
+            return RunSettings(preset, source, config, method, splats, self.tiles)
         begun = load_settings(folder)
         if self.scene or self.source:
             # The data may have moved; whether it is the same scene, the checkpoint knows.
@@ -227,6 +277,8 @@ class Train(ComputingCommand, SceneOptions):
             raise UsageError(
                 f"--from-splats {self.from_splats}: the run to continue began with {begun.splats}"
             )
+        if self.tiles not in (None, begun.tiles) and not (self.tiles == "auto" and begun.tiles):
+            raise UsageError(f"--tiles {self.tiles}: the run to continue began with {begun.tiles or 'none'}")
         if self.preset not in (None, begun.preset):
             raise UsageError(f"--preset {self.preset}: the run to continue began with preset {begun.preset}")
         self.check_same_reading(begun.scene)
@@ -314,6 +366,8 @@ class Train(ComputingCommand, SceneOptions):
                 earlier.look()
             raise type(stop)(interrupted(folder, earlier)) from None
         seconds = time.perf_counter() - start
+        if earlier is not None:
+            earlier.look()  # before anything new is written: what is there now is the earlier run's
         if last is not None:
             write_json(
                 folder / TRAINING_NAME,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileOrRunArgument
+from compgs.cli.command import NO_DEFAULT, DecodingCommand, MemoryOption, SceneFileOrRunArgument
 from compgs.cli.console import say
 from compgs.cli.run_folder import file_and_run
 from compgs.cli.usage import UsageError
@@ -16,7 +16,7 @@ from compgs.cli.viewing import check_viewing, listening
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(DecodingCommand, SceneFileOrRunArgument):
+class View(DecodingCommand, SceneFileOrRunArgument, MemoryOption):
     """Show a file of splats in the browser: walk around in it, look behind it, record a flight.
 
     This process renders what each visitor sees, exactly: small pictures while the camera moves, one at the window's
@@ -54,6 +54,7 @@ class View(DecodingCommand, SceneFileOrRunArgument):
         self.check_values()
         from compgs.formats import check_scene
 
+        self.allow_memory()
         file, _ = file_and_run(self.file)
         check_scene(file)
         self.prepare("decode", "render")

@@ -40,8 +40,19 @@ def decode(path: "str | Path", device: "Device | None" = None, *, prefix: int | 
             data = file.read(-1 if prefix is None else max(0, prefix))
     except OSError as error:
         raise NotACompGSFile(f"{path}: cannot be read ({error.strerror})") from error
+    return decode_bytes(data, path, device, prefix=prefix is not None)
+
+
+def decode_bytes(
+    data: bytes,
+    path: Path,  # that they are from, for messages
+    device: "Device | None" = None,
+    *,
+    prefix: bool = False,
+) -> HybridModel:
+    """The scene in the bytes of a file, or in the beginning of them. Raises BitstreamError, as `decode`."""
     try:
-        content, latents = read_latents(data, keep_symbols=False, prefix=prefix is not None)
+        content, latents = read_latents(data, keep_symbols=False, prefix=prefix)
         model = from_latents(content, latents)
     except BitstreamError as error:
         raise type(error)(f"{path}: {error}") from error

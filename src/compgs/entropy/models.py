@@ -53,6 +53,23 @@ class Quantized:
     residuals: Tensor  # [N, K * residual_dim]
     bits: dict[str, Tensor]  # stream -> [N] bits per anchor; empty when not asked for
 
+    def latents(self) -> tuple[Tensor, Tensor, Tensor]:
+        """References, covariances and residuals."""
+        return self.references, self.covariances, self.residuals
+
+    def cut(self) -> "Quantized":
+        """The same latents as leaves of another graph: gradients of what is made of them end there."""
+        references, covariances, residuals = (latent.detach().requires_grad_() for latent in self.latents())
+        return Quantized(references, covariances, residuals, {})
+
+    def of(self, part: Tensor | None) -> "Quantized":
+        """Of the rows `part` [V] int64; None: of all."""
+        if part is None:
+            return self
+        references, covariances, residuals = (latent.index_select(0, part) for latent in self.latents())
+        bits = {name: of_stream.index_select(0, part) for name, of_stream in self.bits.items()}
+        return Quantized(references, covariances, residuals, bits)
+
 
 class EntropyModel(nn.Module):
     """Hyperprior for the reference embeddings, the references as context for everything else (CompGS Sec. 3.3).

@@ -5,6 +5,7 @@ value that the decoder will have. Rendering sees rounded values with a straight-
 values with uniform noise (Ballé et al. 2017); both as in the authors' release.
 """
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,12 @@ class UniformNoise:
         generator = torch.Generator(device).manual_seed(seed)
         self.pool = torch.rand(self.POOL, generator=generator, device=device) - 0.5
         self.places = places
+
+    def of_places(self, places: np.random.Generator) -> "UniformNoise":
+        """Noise of the same pool, from other places."""
+        other = copy.copy(self)
+        other.places = places
+        return other
 
     def __call__(self, like: Tensor) -> Tensor:
         """Noise of the shape of `like`, to be read only."""

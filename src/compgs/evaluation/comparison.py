@@ -53,7 +53,8 @@ from compgs.evaluation.camera_path import camera_entry, read_cameras, surround
 from compgs.evaluation.measure import encode_png, timed_decode, timed_render
 from compgs.evaluation.reports.comparison_page import ComparisonPage
 from compgs.evaluation.reports.pictures import difference_picture, levels_between, scale_for
-from compgs.formats import check_scene, component_bytes, format_of
+from compgs.formats import check_scene, component_bytes, format_of, scene_file, scene_name
+from compgs.formats.tiled_scene import TiledScene
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
 from compgs.outputs import check_output_folder, filling, write_bytes, write_json
@@ -215,7 +216,7 @@ def compare(
 
     Raises BitstreamError, SplatFileError, SceneError, OutputError.
     """
-    paths = Path(a), Path(b)
+    paths = scene_file(Path(a)), scene_file(Path(b))
     for path in paths:
         check_scene(path)
     if scene is not None and cameras is not None:
@@ -229,7 +230,7 @@ def compare(
     if output is None:
         return _compared(sides, places, origin, read, notes, chosen, progress)
     with filling(Path(output)) as folder:
-        page = ComparisonPage(paths[0].name, paths[1].name)
+        page = ComparisonPage(scene_name(paths[0]), scene_name(paths[1]))
 
         def keep(row: ComparedView, pictures: dict[str, np.ndarray]) -> None:
             for name, picture in pictures.items():
@@ -272,7 +273,7 @@ def _opened(
         timed_decode(path, device, behind)  # kernels are loaded: not what a file costs
         opened.append(_Side(path, *timed_decode(path, device, behind)))
     models, notes = [side.model for side in opened], []
-    own = [model.background for model in models if isinstance(model, HybridModel)]
+    own = [model.background for model in models if isinstance(model, HybridModel | TiledScene)]
     if background is None and scene is None and own:
         models, behind = [model.over(own[0]) for model in models], own[0]
         if len(set(own)) > 1:
@@ -320,7 +321,7 @@ def _places(
         if len(kept) >= LEAST_OWN:
             return [
                 _Place(f"camera {i}", camera, None) for i, camera in enumerate(kept)
-            ], f"cameras that {side.path.name} keeps"
+            ], f"cameras that {scene_name(side.path)} keeps"
     model = sides[0].model
     around = surround(model.bounds[0])[::AROUND_EVERY]
     back = -np.array(model.world_offset)
@@ -400,7 +401,7 @@ def _described(
     components = component_bytes(side.path)
     counts = side.model.counts
     return ComparedFile(
-        file=side.path.name,
+        file=scene_name(side.path),
         format=format_of(side.path).name,
         bytes=sum(components.values()),  # of a meta.json that of its pictures, too
         sha256=hashlib.sha256(side.path.read_bytes()).hexdigest(),

@@ -19,7 +19,7 @@ from compgs.evaluation.contact_sheet import contact_sheet, striped
 from compgs.evaluation.exposure import DESCRIPTION, exposed_by_left_half, right_half
 from compgs.evaluation.fit import misfits
 from compgs.evaluation.results import Results, ViewResult
-from compgs.formats import component_bytes, open_scene
+from compgs.formats import component_bytes, open_scene, scene_file, scene_name
 from compgs.numerics.compiling import working_seconds
 from compgs.outputs import check_output_folder, write_bytes, write_json
 from compgs.render import Renderable, render
@@ -62,7 +62,7 @@ def evaluate(
     Raises BitstreamError, SplatFileError, OutputError, and SceneError if the scene holds no view out or a mask leaves
     nothing.
     """
-    path, scene = Path(file), as_scene(scene)
+    path, scene = scene_file(Path(file)), as_scene(scene)
     if output is not None:
         check_output_folder(Path(output), overwrite=overwrite)
     if not scene.test_views:
@@ -104,21 +104,21 @@ def evaluate(
         if progress:
             progress(i + 1, len(scene.test_views))
 
-    data = path.read_bytes()
+    components = component_bytes(path)
     results = Results(
         compgs=__version__,
         scene=scene.name,
-        file=path.name,
+        file=scene_name(path),
         width=scene.test_views[0].camera.width,
         height=scene.test_views[0].camera.height,
-        bytes=len(data),
-        components=component_bytes(path),
+        bytes=sum(components.values()),
+        components=components,
         **{"anchors": None, "coupled_primitives": None, "splats": None, **model.counts},
         first_decode_seconds=first_seconds,
         decode_seconds=decode_seconds,
         device=device_name(chosen),
         threads=numba.get_num_threads(),
-        sha256=hashlib.sha256(data).hexdigest(),
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
         lpips_note=lpips_note,
         method=method,
         exposure=DESCRIPTION if exposure else None,

@@ -12,14 +12,14 @@
 | psnr | dB, mean over the views; null if infinite: all renderings are perfect |
 | ssim | mean over the views |
 | lpips | mean over the views, or null; `lpips_note` then says why |
-| bytes | of the whole file |
+| bytes | of the whole file, or of all files of a scene in tiles |
 | components | bytes by component of the file; they sum to `bytes` |
 | anchors, coupled_primitives, splats | counts; null what the file does not have: splats are of all files but .cgs |
 | bits_per_anchor, bits_per_coupled_primitive, bits_per_splat | all bits of the file by each count, or null |
 | first_decode_seconds, decode_seconds | file to model: first in a process (loads kernels, compiles none); again |
 | render_seconds | median over the views, after one view to warm up |
 | device, threads | where it ran |
-| sha256 | of the file |
+| sha256 | of the file; of tiles that of the manifest, which has theirs |
 | exposure | null, or how renderings got the exposure of their photographs, and what was measured then |
 | notes | sentences: in what the scene is not what the file was trained on, as far as the file's cameras tell |
 

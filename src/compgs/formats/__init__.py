@@ -8,6 +8,7 @@
 | .sog 2, zip or meta.json | yes | yes | about 20 |
 | .glb, KHR_gaussian_splatting | yes | yes | 240 |
 | .splat | yes | no | 32, no harmonics |
+| manifest.json of tiles, .cgs files | yes | by `write_tiles` | |
 | .packed, of a method of the comparison | yes | by `compgs.methods.write` | |
 """
 
@@ -22,8 +23,11 @@ from compgs.formats.registry import (
     encoded,
     format_of,
     open_scene,
+    scene_file,
+    scene_name,
     writer_of,
 )
+from compgs.formats.tiled import open_tiles
 
 __all__ = [
     "FORMATS",
@@ -35,7 +39,10 @@ __all__ = [
     "encoded",
     "format_of",
     "open_scene",
+    "open_tiles",
     "read_ply",
+    "scene_file",
+    "scene_name",
     "write_ply",
     "writer_of",
 ]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from compgs.devices import placed
 from compgs.errors import NotACompGSFile, OutputError, SplatFileError
-from compgs.formats import cgs, glb, packed, ply, sog, splat, spz
+from compgs.formats import cgs, glb, packed, ply, sog, splat, spz, tiled
 from compgs.formats.arrays import SplatArrays
 from compgs.model.splats import SplatModel
 
@@ -54,11 +54,16 @@ def _open_packed(path: Path, device: "Device", background: Background) -> "Rende
     return method.open(content, device, background)
 
 
-# In the order in which they are asked; .splat, which nothing marks, is the last.
+def _open_tiles(path: Path, device: "Device", background: Background) -> "Renderable":
+    return tiled.open_tiles(path, device)
+
+
+# In the order in which they are asked: tiles before .sog, as both may be JSON; .splat, which nothing marks, comes last.
 FORMATS = (
     Format("cgs", cgs.begins, cgs.check, cgs.component_bytes, _open_cgs),
     Format("ply", ply.begins, ply.check, ply.component_bytes, _opens_splats(ply.read)),
     Format("spz", spz.begins, spz.check, spz.component_bytes, _opens_splats(spz.read)),
+    Format("tiles", tiled.begins, tiled.check, tiled.component_bytes, _open_tiles),
     Format("sog", sog.begins, sog.check, sog.component_bytes, _opens_splats(sog.read)),
     Format("glb", glb.begins, glb.check, glb.component_bytes, _opens_splats(glb.read)),
     Format("packed", packed.begins, packed.check, packed.component_bytes, _open_packed),
@@ -76,8 +81,20 @@ WRITERS: dict[str, Callable[[SplatArrays], bytes]] = {
 KEEP_WORLD_OFFSET = ("ply", "glb")
 
 
+def scene_file(path: Path) -> Path:
+    """The path itself; of a folder of tiles, its manifest."""
+    manifest = path / tiled.MANIFEST
+    return manifest if manifest.is_file() else path
+
+
+def scene_name(path: Path) -> str:
+    """What to call a scene: the name of its file, or of the folder that a manifest describes."""
+    return path.parent.name if path.name == tiled.MANIFEST else path.name
+
+
 def format_of(path: Path) -> Format:
     """Of a file that is there. Raises NotACompGSFile for one that is of no known format, or is no file."""
+    path = scene_file(path)
     names = ", ".join(f".{each.name}" for each in FORMATS[1:])
     if path.is_dir():
         files = sorted(path.glob("*.cgs")) or sorted(path.glob("meta.json"))
@@ -99,7 +116,7 @@ def format_of(path: Path) -> Format:
 
 def check_scene(path: str | Path) -> None:
     """Raises BitstreamError, SplatFileError if there is no whole file to read, before anything is decoded."""
-    path = Path(path)
+    path = scene_file(Path(path))
     format_of(path).check(path)
 
 
@@ -110,16 +127,16 @@ def open_scene(
         0.0,
         0.0,
         0.0,
-    ),  # RGB, 0 to 1, where the file does not know its own: all but .cgs
+    ),  # RGB, 0 to 1, where the file does not know its own: all but .cgs and tiles
 ) -> "Renderable":
     """A scene that can be rendered, of any format. Raises BitstreamError, SplatFileError, MissingDependency."""
-    path = Path(path)
+    path = scene_file(Path(path))
     return format_of(path).open(path, device, background)
 
 
 def component_bytes(path: str | Path) -> dict[str, int]:
     """Bytes of each component of a file; they sum to its size. Raises as `open_scene` does."""
-    path = Path(path)
+    path = scene_file(Path(path))
     return format_of(path).component_bytes(path)
 
 

@@ -19,11 +19,14 @@ if TYPE_CHECKING:
 SPLAT_SETTINGS = (
     "splats",
     "training.steps",
+    "training.views_per_step",
     "training.seed",
     "training.ssim_weight",
     "training.exposure",
     "training.checkpoint_minutes",
 )
+# Of files in the shared container: `compgs.formats.packed.SUFFIX`, without loading the formats.
+PACKED_SUFFIX = ".packed"
 Presets = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from compgs.scene.points import MIN_POINTS, fallback_points
 from compgs.scene.unused import unposed_photographs
 from compgs.scene.views import Points, Scene, View, scene_extent
 
-__all__ = ["Points", "Scene", "View", "as_scene", "load_scene"]
+__all__ = ["Points", "Scene", "View", "as_scene", "extent_of", "load_scene"]
 
 FALLBACK_POINTS = 20_000  # random points of a scene without sparse points
 MAX_DOWNSCALE = 32  # beyond it somebody means a width in pixels
@@ -35,6 +36,7 @@ def load_scene(
     holdout: bool = True,  # False: all views are trained on
     background: tuple[float, float, float] | None = None,  # display RGB, 0 to 1; None: the layout's
     progress: Progress | None = None,  # called with (done, total) views
+    at_once: bool = True,  # photographs that all fit into memory are decoded now; False: when somebody looks
 ) -> Scene:
     """Reads a capture: COLMAP, Blender (`transforms_train.json`) or nerfstudio (`transforms.json`).
 
@@ -55,7 +57,7 @@ def load_scene(
 
     behind = background or capture.background
     cut_out = capture.cut_out and background is None
-    views = load_views(capture.images, downscale, None if cut_out else behind, progress)
+    views = load_views(capture.images, downscale, None if cut_out else behind, progress, at_once=at_once)
     held_out = _held_out(capture, test_every) if holdout else frozenset()
     points, notes = _enough_points(capture, views)
     return Scene(
@@ -64,7 +66,7 @@ def load_scene(
         test_views=tuple(v for v in views if v.name in held_out),
         points=points,
         background=behind,
-        extent=_extent(views, points),
+        extent=extent_of(views, points),
         source=folder,
         notes=capture.notes + unposed + notes,
     )
@@ -218,7 +220,8 @@ def _different(positions: np.ndarray) -> int:  # positions: [P, 3]
     return few if few >= MIN_POINTS else len(np.unique(positions, axis=0))
 
 
-def _extent(views: list[View], points: Points) -> float:
+def extent_of(views: Sequence[View], points: Points) -> float:
+    """World units: as `scene_extent`; of views that are all from one place, the distance of the points."""
     centers = np.stack([view.camera.center for view in views])
     extent = scene_extent(centers)
     distance = float(np.median(np.linalg.norm(points.positions - centers.mean(axis=0), axis=1)))

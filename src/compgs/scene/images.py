@@ -62,11 +62,13 @@ def load_views(
     background: tuple[float, float, float] | None,  # behind transparent pixels; None: these do not count
     progress: Progress | None = None,
     cache: ImageCache[Photograph] | None = None,
+    *,
+    at_once: bool = True,
 ) -> list[View]:
     """The views at 1 / downscale of their images' size, in the given order, with their masks.
 
     Headers, sizes and cameras are checked. Images that all fit into the cache are decoded at once, and so checked; of a
-    larger capture each is decoded when its view is looked at.
+    larger capture, or if not `at_once`, each is decoded when its view is looked at.
     """
     cache = cache or ImageCache()
     cameras = _checked_cameras(images)
@@ -106,7 +108,7 @@ def load_views(
         return View(images[index].name, camera.resized(width, height), stored.image, stored.mask)
 
     views = _in_threads(view, len(images), None)
-    if sum(3 * view.camera.width * view.camera.height for view in views) <= cache.most_bytes:
+    if at_once and sum(3 * view.camera.width * view.camera.height for view in views) <= cache.most_bytes:
         _in_threads(lambda index: views[index].image.shape, len(images), progress)
     return views
 

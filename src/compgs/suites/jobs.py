@@ -11,6 +11,7 @@ from typing import Any
 
 from compgs.errors import SceneError
 from compgs.evaluation.reports.runs import RESULTS_NAME
+from compgs.interrupt import Terminated
 from compgs.outputs import write_json
 from compgs.suites.suite import MethodEntry, SceneEntry, SetValue, Suite
 
@@ -35,6 +36,11 @@ class Job:
     def asked(self) -> dict[str, Any]:
         """What makes it this run and no other, as JSON has it."""
         return {**asdict(self), "folder": self.folder.name, "command": list(self.command)}
+
+    @property
+    def continues_by(self) -> tuple[str, ...]:
+        """Options with which it is continued after a stop, beside `--resume`."""
+        return ()
 
     @property
     def done(self) -> bool:
@@ -93,7 +99,7 @@ def run_job(job: Job) -> Outcome:
         return Outcome(job)
     job.folder.mkdir(parents=True, exist_ok=True)
     if job.begun and (job.folder / CHECKPOINT_NAME).is_file():
-        arguments = ["train", "-o", str(job.folder), "--resume"]
+        arguments = ["train", "-o", str(job.folder), "--resume", *job.continues_by]
     else:
         arguments = [*job.command, "-o", str(job.folder), "--overwrite"]
         write_json(job.folder / JOB_NAME, job.asked)
@@ -116,8 +122,10 @@ def _run(arguments: Sequence[str], log: Path) -> int:
         )
         try:
             return process.wait()
-        except KeyboardInterrupt:
-            process.wait()  # it was interrupted, too, and is writing its checkpoint
+        except KeyboardInterrupt as stop:
+            if isinstance(stop, Terminated):  # of which only this process knows; Ctrl-C reaches both
+                process.terminate()
+            process.wait()  # it is writing its checkpoint
             raise
 
 

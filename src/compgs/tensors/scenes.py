@@ -262,6 +262,14 @@ def on_device(model: HybridModel | SplatModel, device: torch.device) -> HybridMo
     return SplatsOnDevice.of(model, device)
 
 
+def drawn_gaussians(
+    gaussians: Gaussians[np.ndarray], camera: Camera, settings: RasterSettings, device: torch.device
+) -> RasterResult[np.ndarray]:
+    """The picture of Gaussians of several scenes, in one frame."""
+    g = Gaussians(*(torch.from_numpy(np.array(value)).to(device) for value in vars(gaussians).values()))
+    return _drawn(g, camera, settings)
+
+
 def _drawn(
     gaussians: Gaussians[Tensor], camera: Camera, settings: RasterSettings
 ) -> RasterResult[np.ndarray]:

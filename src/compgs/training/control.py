@@ -14,7 +14,9 @@ In few steps a primitive cannot be seen often. The published minimum of more tha
 enough (`minimum_share`). From 103 views on, a fifth of 2 V steps is no less than the published minimum.
 """
 
+import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -22,8 +24,7 @@ from torch import Tensor
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
 from compgs.tensors.prediction import Prediction
-from compgs.trained_model import TrainedModel
-from compgs.training.optimizers import replace_rows
+from compgs.training.optimizers import AnchorRows, replace_rows
 
 # (gradient threshold factor, grid size in voxels), coarse first
 GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
@@ -47,6 +48,12 @@ class ControlSchedule:
     stop: int
     every: int
     observe: int = 0
+    views: int = 1  # of a step
+
+    @property
+    def between(self) -> int:
+        """Views that are looked at between two controls."""
+        return self.every * self.views
 
     def active(self, step: int) -> bool:
         """Statistics are gathered in this step."""
@@ -60,30 +67,48 @@ class ControlSchedule:
         return step >= self.stop
 
 
-def make_schedule(config: ControlConfig, steps: int, views: int) -> ControlSchedule:
+def make_schedule(config: ControlConfig, steps: int, views: int, views_per_step: int = 1) -> ControlSchedule:
     """Fractions of the run in steps, or passes over the views where these end earlier; see the module's docstring.
 
     Between two controls every view is seen about once, at least. Statistics begin early enough for the first control
     to judge as many steps as the others.
     """
+
+    def pass_steps(passes: float) -> int:
+        return round(passes * max(views, SHORTEST_PASS) / views_per_step)
+
     start, every = round(config.start * steps), round(config.every * steps)
     if config.start_passes is not None:  # Steps count from 0: the last of n passes is step n V - 1.
-        start = min(start, _pass_steps(config.start_passes, views) - 1)
+        start = min(start, pass_steps(config.start_passes) - 1)
     if config.every_passes is not None:
-        every = min(every, _pass_steps(config.every_passes, views))
-    start, every = max(1, start), max(1, every, views)
-    observe = min(_pass_steps(config.observe_passes, views), start + 1 - every)
-    return ControlSchedule(start, round(config.stop * steps), every, max(0, observe))
-
-
-def _pass_steps(passes: float, views: int) -> int:
-    return round(passes * max(views, SHORTEST_PASS))
+        every = min(every, pass_steps(config.every_passes))
+    start, every = max(1, start), max(1, every, math.ceil(views / views_per_step))
+    observe = min(pass_steps(config.observe_passes), start + 1 - every)
+    return ControlSchedule(start, round(config.stop * steps), every, max(0, observe), views_per_step)
 
 
 def rate_weight(config: ControlConfig, lmbda: float) -> float:
     """How much more an anchor has to add to the image than at the usual lambda, since it costs bits."""
     least, most = LAMBDA_RANGE
     return (min(max(lmbda, least), most) / USUAL_LAMBDA) ** config.rate_exponent
+
+
+class Grows(AnchorRows, Protocol):
+    """A model to which control adds anchors."""
+
+    @property
+    def voxel_size(self) -> float: ...
+
+    @property
+    def references(self) -> Tensor:
+        """[N, C] what a new anchor has from those that asked for it: the largest of them, channel by channel."""
+        ...
+
+    def grown(self, coordinates: Tensor, references: Tensor, log_scale: Tensor) -> dict[str, Tensor]:
+        """Rows of new anchors by name, as `replace_rows` takes them, at coordinates [A, 3] int32 with references [A, C]
+        and the logarithm [A] of their cells' sizes in voxels.
+        """
+        ...
 
 
 class AdaptiveControl:
@@ -117,19 +142,19 @@ class AdaptiveControl:
     @torch.no_grad()
     def act(
         self,
-        model: TrainedModel,
+        model: Grows,
         optimizer: torch.optim.Adam,
         means: Tensor,
         noise: torch.Generator,
         lmbda: float,
     ) -> None:
         """Grow and prune. means: [N, K, 3] of all coupled primitives, world units; lmbda: the rate's present weight."""
-        c, n, every = self.config.control, model.anchors, self.schedule.every
-        judged = self.drawn >= min(c.minimum_views, int(c.minimum_share * every))
+        c, n, views = self.config.control, model.anchors, self.schedule.between
+        judged = self.drawn >= min(c.minimum_views, int(c.minimum_share * views))
         gradient = torch.where(judged, self.gradient / self.drawn.clamp_min(1), 0.0)
         added = self._grow(model, means, gradient, noise, lmbda)
 
-        ripe = self.seen >= max(c.opacity_views, int(c.opacity_share * every))
+        ripe = self.seen >= max(c.opacity_views, int(c.opacity_share * views))
         transparent = self.opacity / self.seen.clamp_min(1) < c.opacity_threshold
         kept = ~(ripe & transparent)
         if not kept.any():
@@ -151,7 +176,7 @@ class AdaptiveControl:
         self.seen[ripe] = 0
 
     @torch.no_grad()
-    def keep(self, model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor) -> None:
+    def keep(self, model: Grows, optimizer: torch.optim.Adam, kept: Tensor) -> None:
         """Remove all anchors but those that are `kept`, [N] bool."""
         none = {
             name: getattr(model, name).detach()[:0]
@@ -160,7 +185,7 @@ class AdaptiveControl:
         self._replace(model, optimizer, kept, none)
 
     def _replace(
-        self, model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]
+        self, model: Grows, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]
     ) -> None:
         replace_rows(model, optimizer, kept, added)
         new = len(added["coordinates"])
@@ -169,10 +194,10 @@ class AdaptiveControl:
             setattr(self, name, torch.cat([old[kept], old.new_zeros(new, *old.shape[1:])]))
 
     def _grow(
-        self, model: TrainedModel, means: Tensor, gradient: Tensor, noise: torch.Generator, lmbda: float
+        self, model: Grows, means: Tensor, gradient: Tensor, noise: torch.Generator, lmbda: float
     ) -> dict[str, Tensor]:
         """New anchors by name of their parameter. gradient: [N, K] mean norms, 0 where not judged."""
-        c, k = self.config.control, model.dimensions.coupled_primitives
+        c, k = self.config.control, means.shape[1]
         flat = gradient.view(-1)
         target = torch.round(means.view(-1, 3) / model.voxel_size)
         inside = (target.abs() < COORDINATE_LIMIT - 16).all(1)
@@ -180,7 +205,7 @@ class AdaptiveControl:
         room = max(0, self.config.model.max_anchors - model.anchors)
         threshold = c.gradient_threshold * rate_weight(c, lmbda)
         coordinates, references = [taken[:0]], [model.references.detach()[:0]]
-        log_scales = [means.new_zeros(0, 6)]
+        log_scales = [means.new_zeros(0)]
         for level, ((factor, size), probability) in enumerate(
             zip(GROWTH_LEVELS, c.growth_probabilities, strict=True)
         ):
@@ -194,17 +219,12 @@ class AdaptiveControl:
             parents = model.references.detach()[slots[asked >= 0] // k]
             coordinates.append(cells)
             references.append(largest(parents, asked[asked >= 0], len(cells)))
-            log_scales.append(means.new_full((len(cells), 6), float(size)).log())
+            log_scales.append(means.new_full((len(cells),), float(size)).log())
             taken = torch.cat([taken, cells])
             room -= len(cells)
-        new = len(taken) - model.anchors
-        return {
-            "coordinates": torch.cat(coordinates).to(torch.int32),
-            "references": torch.cat(references),
-            "log_scales": torch.cat(log_scales),
-            "residuals": model.entropy.starting_residuals().repeat(new, 1),
-            "mask": model.mask.new_ones(new, k),
-        }
+        return model.grown(
+            torch.cat(coordinates).to(torch.int32), torch.cat(references), torch.cat(log_scales)
+        )
 
 
 def new_cells(

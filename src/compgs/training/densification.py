@@ -11,6 +11,7 @@ time there is; between two resets `RECOVERY_PASSES` and `RECOVERY_STEPS`, and no
 before densification ends. Floors end at the published numbers of steps: a run of 30 000 steps goes as published.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -50,9 +51,10 @@ class DensifySchedule:
         return 0 < step <= last and step % self.reset_every == 0
 
 
-def densify_schedule(config: SplatConfig, steps: int, views: int) -> DensifySchedule:
+def densify_schedule(config: SplatConfig, steps: int, views: int, views_per_step: int = 1) -> DensifySchedule:
     """Fractions of the run in steps; see the module's docstring for the floors."""
     stop = round(config.densify_stop * steps)
+    views = math.ceil(views / views_per_step)  # steps of a pass
     few = min(max(views, stop // 10), PUBLISHED_EVERY)
     recovery = min(max(RECOVERY_PASSES * views, RECOVERY_STEPS), PUBLISHED_RESET)
     return DensifySchedule(

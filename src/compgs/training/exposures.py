@@ -8,6 +8,8 @@ the colors between all views. A decay pulls them back to M = 1, b = 0, else all 
 the scene darkens.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -28,22 +30,33 @@ class Exposures:
         self.change = torch.zeros(views, 3, 4, device=device)  # from the neutral one
         self.moments = torch.zeros(2, views, 3, 4, device=device)
         self.steps = torch.zeros(views, dtype=torch.int64)
-        self._current: tuple[int, Tensor] | None = None
+        self._looked_at: dict[int, Tensor] = {}
 
     def of(self, view: int) -> Tensor:
-        """[3, 4] of a view, whose gradient is learned from next."""
+        """[3, 4] of a view, whose gradient `gradients` gives next."""
         exposure = (self.neutral + self.change[view]).requires_grad_()
-        self._current = view, exposure
+        self._looked_at[view] = exposure
         return exposure
 
     @torch.no_grad()
-    def learn(self, progress: float) -> None:
-        """One step on the view that was asked for last, if it has a gradient; `progress` of the run, 0 to 1."""
-        if self._current is None or self._current[1].grad is None:
-            return
-        view, exposure = self._current
-        gradient = exposure.grad
-        assert gradient is not None
+    def gradients(self, views: Sequence[int]) -> Tensor:
+        """[V, 13] of views: of M and b, and whether there is one (1) or none (all 0): `of` was not asked since."""
+        found = self.change.new_zeros(len(views), 13)
+        for row, view in zip(found, views, strict=True):
+            exposure = self._looked_at.pop(view, None)
+            if exposure is not None and exposure.grad is not None:
+                row[:12], row[12] = exposure.grad.view(-1), 1.0
+        self._looked_at.clear()
+        return found
+
+    @torch.no_grad()
+    def learn(self, progress: float, views: Sequence[int], gradients: Tensor) -> None:
+        """One step on each of the views that has a gradient [V, 13]; `progress` of the run, 0 to 1."""
+        for view, there, gradient in zip(views, gradients[:, 12].tolist(), gradients[:, :12], strict=True):
+            if there:
+                self._step(progress, view, gradient.view(3, 4))
+
+    def _step(self, progress: float, view: int, gradient: Tensor) -> None:
         first, last = LEARNING_RATES
         rate = first * (last / first) ** progress
         self.steps[view] += 1
@@ -53,7 +66,6 @@ class Exposures:
             means.append(moment[view] / (1 - keep ** int(self.steps[view])))
         self.change[view] *= 1 - rate * DECAY
         self.change[view] -= rate * means[0] / (means[1].sqrt() + EPSILON)
-        self._current = None
 
     def tensors(self) -> dict[str, Tensor]:
         """For a checkpoint."""

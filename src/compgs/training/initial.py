@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from compgs.config import MAX_VIEWPOINTS, Config
+from compgs.config import MAX_VIEWPOINTS, Config, ModelConfig
 from compgs.errors import ConfigError
 from compgs.numerics.nearest import nearest
 from compgs.scene.points import colors_at, median_spacing, voxel_grid
@@ -26,26 +26,15 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
     cameras = [view.camera for view in scene.train_views]
     offset = world_offset(scene)
     scene = local_scene(scene, offset)
-    wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
-    coordinates, voxel_size = voxel_grid(scene.points, wanted)
-    if m.voxel_size and len(coordinates) > m.max_anchors:
-        raise ConfigError(
-            f"model.voxel_size = {m.voxel_size}: the scene's points fill {len(coordinates)} voxels, "
-            f"model.max_anchors is {m.max_anchors}; use a larger voxel, or allow more anchors"
-        )
-    while len(coordinates) > m.max_anchors:  # ends: at last all points are in one voxel
-        coordinates, voxel_size = voxel_grid(scene.points, COARSER * voxel_size)
+    coordinates, voxel_size = anchor_grid(scene, m)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.training.seed)
         model = TrainedModel(
             config, torch.from_numpy(coordinates), voxel_size, scene.extent, scene.background, offset
         )
-    neighbours = min(4, len(coordinates))
-    distances, _ = nearest(coordinates, coordinates, neighbours)
-    spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(1)
     with torch.no_grad():
         model.log_scales.copy_(
-            torch.from_numpy(np.log(np.maximum(spread, 0.1))).float()[:, None].expand(-1, 6)
+            torch.from_numpy(np.log(anchor_spacing(coordinates))).float()[:, None].expand(-1, 6)
         )
         model.entropy.fit_covariance_prior(model.log_scales)
         if m.point_colors:
@@ -56,6 +45,31 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
         model.viewpoints = tuple(cameras[i] for i in choose_viewpoints(cameras, MAX_VIEWPOINTS))
         model.up = up_direction(cameras)
     return model
+
+
+def anchor_grid(scene: Scene, m: ModelConfig) -> tuple[np.ndarray, float]:
+    """[N, 3] int32 voxels that the scene's points fill, and the voxels' size in world units.
+
+    Raises ConfigError if the voxel size that was asked for gives more than `max_anchors`.
+    """
+    wanted = m.voxel_size or m.voxel_spacings * median_spacing(scene.points.positions)
+    coordinates, voxel_size = voxel_grid(scene.points, wanted)
+    if m.voxel_size and len(coordinates) > m.max_anchors:
+        raise ConfigError(
+            f"model.voxel_size = {m.voxel_size}: the scene's points fill {len(coordinates)} voxels, "
+            f"model.max_anchors is {m.max_anchors}; use a larger voxel, or allow more anchors"
+        )
+    while len(coordinates) > m.max_anchors:  # ends: at last all points are in one voxel
+        coordinates, voxel_size = voxel_grid(scene.points, COARSER * voxel_size)
+    return coordinates, voxel_size
+
+
+def anchor_spacing(coordinates: np.ndarray) -> np.ndarray:
+    """[N] voxels: how far an anchor's neighbours are from it, the root of the mean square of three distances."""
+    neighbours = min(4, len(coordinates))
+    distances, _ = nearest(coordinates, coordinates, neighbours)
+    spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(1)
+    return np.maximum(spread, 0.1)
 
 
 def logit(colors: np.ndarray) -> np.ndarray:

@@ -19,7 +19,8 @@ from compgs.losses import Target, exposed
 from compgs.render import RasterResult, RasterSettings, Renderable
 from compgs.tensors.rasterize import rasterize
 from compgs.training.allocation import freed_memory_kept
-from compgs.training.checkpoint import CHECKPOINT_NAME
+from compgs.training.checkpoint import CHECKPOINT_NAME, Writer
+from compgs.training.distributed import local_device, on_any_rank, rank, stopping_together
 from compgs.training.profile import StepProfile
 
 REPORT_EVERY = 10  # steps between two status reports
@@ -105,7 +106,9 @@ class Trains(Protocol):
 
     def finish(self) -> None: ...
 
-    def save(self, path: Path) -> None: ...
+    def save(self, path: Path | None, writer: Writer | None = None) -> None:
+        """Write a checkpoint, or let the writer do it. On all ranks at once; None on those that do not write."""
+        ...
 
 
 # Called between any two steps, for whoever wants to look at the scene as it grows.
@@ -123,8 +126,8 @@ def rasterize_step(
 
 
 def chosen_device(device: str | torch.device | None) -> torch.device:
-    """The given one, else CUDA where there is one."""
-    return torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    """The given one, else CUDA where there is one; of several processes on a machine each has its own GPU."""
+    return local_device(torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu")))
 
 
 def chosen_config(config: Config | None, preset: str | None) -> Config:
@@ -183,31 +186,59 @@ class Saving:
 
     A run that takes the place of an earlier one leaves the earlier checkpoint until it has been going for long enough
     to write one of its own: whoever stops it at once keeps what there was.
+
+    Those on the way are written beside the steps that follow. Of several ranks only rank 0 writes, and decides, but a
+    checkpoint needs all of them.
     """
 
     def __init__(self, trainer: Trains, path: Path | None, minutes: float) -> None:
         self.trainer = trainer
         self.path = path
+        self.writer = Writer()
+        self.begun = False
         self.seconds = 60 * minutes
         self.saved = time.perf_counter()
-        self.replaces = path is not None and trainer.step == 0 and path.exists()
+        (self.writes,) = on_any_rank(path is not None)
+        (self.replaces,) = on_any_rank(path is not None and trainer.step == 0 and path.exists())
 
     def due(self) -> bool:
-        return self.path is not None and time.perf_counter() - self.saved > self.seconds
+        if not self.writes:
+            return False
+        waited = time.perf_counter() - self.saved > self.seconds
+        (due,) = on_any_rank(self.path is not None and waited and not self.begun)
+        return due
 
-    def save(self) -> float:
+    def save(self, writer: Writer | None = None) -> float:
         """Seconds that it took. Whoever stops the run meanwhile is heard when the checkpoint is whole."""
         start = time.perf_counter()
-        if self.path is not None:
+        if self.writes:
             with held_back():
-                self.trainer.save(self.path)
+                self.trainer.save(self.path, writer)
         self.saved, self.replaces = time.perf_counter(), False
         return self.saved - start
+
+    def begin(self) -> float:
+        """Let a checkpoint be written while the run goes on; seconds that it waited."""
+        self.begun = self.path is not None
+        return self.save(self.writer)
+
+    def last(self) -> None:
+        """The checkpoint of the end."""
+        with held_back():
+            self.writer.finish()
+            self.save()
+
+    def ended(self) -> bool:
+        """Whether one that was begun has been written since this was asked last. Raises OutputError if it could not."""
+        ended = self.begun and not self.writer.busy
+        self.begun = self.begun and not ended
+        self.writer.check()
+        return ended
 
     def stopped(self) -> None:
         """Save, unless an earlier run's checkpoint would be lost."""
         if not self.replaces:
-            self.save()
+            self.last()
 
 
 @freed_memory_kept()
@@ -219,32 +250,37 @@ def run_to_end(
     watch: Watch | None = None,
 ) -> None:
     """All remaining steps; checkpoints at `path` as `Saving` says. Progress is reported now and then, and right after
-    each checkpoint. What `watch` does takes its time, and changes nothing."""
+    each checkpoint. What `watch` does takes its time, and changes nothing. Of several ranks rank 0 alone writes
+    and reports."""
+    if rank() > 0:
+        path, on_progress, watch = None, None, None
     saving, pace, estimate = Saving(trainer, path, config.checkpoint_minutes), Pace(), 0
     try:
         while trainer.step < config.steps:
-            with held_back():
-                result = trainer.train_step()
-            pace.step()
-            saves = saving.due()
-            told = trainer.step % REPORT_EVERY == 0 or trainer.step == config.steps or saves
-            # Before anything is computed from what has diverged.
-            if told and not torch.isfinite(result.loss):
-                raise diverged(trainer.step, "loss", float(result.loss))
-            if saves:
-                pace.pause(saving.save())
-            if on_progress and told:
-                seconds = pace.look()
-                if trainer.step % ESTIMATE_EVERY == 0 or not estimate:
-                    estimate = trainer.estimated_bytes()
-                on_progress(_status(trainer, config.steps, result, estimate, seconds))
-            if watch:
-                watch(trainer)
-        trainer.finish()
+            with stopping_together():
+                with held_back():
+                    result = trainer.train_step()
+                pace.step()
+                told = trainer.step % REPORT_EVERY == 0 or trainer.step == config.steps or saving.ended()
+                saves = saving.due()
+                # Before anything is computed from what has diverged.
+                if (told or saves) and not torch.isfinite(result.loss):
+                    raise diverged(trainer.step, "loss", float(result.loss))
+                if saves:
+                    pace.pause(saving.begin())
+                if on_progress and told:
+                    seconds = pace.look()
+                    if trainer.step % ESTIMATE_EVERY == 0 or not estimate:
+                        estimate = trainer.estimated_bytes()
+                    on_progress(_status(trainer, config.steps, result, estimate, seconds))
+                if watch:
+                    watch(trainer)
+        with stopping_together():
+            trainer.finish()
     except KeyboardInterrupt:
         saving.stopped()
         raise
-    saving.save()
+    saving.last()
 
 
 def _status(trainer: Trains, steps: int, result: StepResult, estimate: int, pace: float) -> TrainingStatus:

@@ -1,8 +1,16 @@
-"""Adam over the scene's parameters: one group a learning rate, log-linear decay, rows that come and go (Sec. 3.4)."""
+"""Adam over the scene's parameters: one group a learning rate, log-linear decay, rows that come and go (Sec. 3.4).
+
+Settings are for one view a step. A step of V views is to go as far as V steps of one view each. Its gradient is the
+sum of theirs, and as views mostly show different primitives, or pull at one in different directions, its root mean
+square is the root of V times one view's. Adam divides by that, so the learning rates are multiplied by it; and betas
+are raised to the power of V, so that the moments remember as many views as before (Zhao et al. 2024, "On Scaling Up 3D
+Gaussian Splatting Training", Grendel).
+"""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -15,6 +23,7 @@ from compgs.trained_model import TrainedModel
 HEAD_GROUPS = ("geometry", "appearance", "translation", "covariance", "opacity", "color")
 ROW_CHUNKS = 32
 ADAM_EPSILON = 1e-15  # gradients of single primitives are tiny (3DGS)
+BETAS = (0.9, 0.999)  # Adam's, for one view a step
 
 
 def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.Adam:
@@ -24,6 +33,7 @@ def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.A
     entropy_lr = config.entropy_lr[0] * longer, config.entropy_lr[1] * longer
 
     def group(name: str, parameters: Iterable[nn.Parameter], rates: tuple[float, float]) -> dict:
+        rates = rates_for(config.views_per_step, rates)
         return {"name": name, "params": list(parameters), "lr": rates[0], "rates": rates}
 
     groups = [
@@ -41,7 +51,23 @@ def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.A
         "color": config.color_lr,
     }
     groups += [group(name, network.parameters(), head_rates[name]) for name, network in heads.networks()]
-    return torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
+    betas = betas_for(config.views_per_step)
+    return torch.optim.Adam(groups, lr=1e-3, betas=betas, eps=ADAM_EPSILON, fused=True)
+
+
+def parameters_of(optimizer: torch.optim.Optimizer) -> list[nn.Parameter]:
+    """All that it moves."""
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
+
+
+def rates_for(views: int, rates: tuple[float, float]) -> tuple[float, float]:
+    """First and last learning rate of steps of so many views, from those of steps of one."""
+    return rates[0] * math.sqrt(views), rates[1] * math.sqrt(views)
+
+
+def betas_for(views: int) -> tuple[float, float]:
+    """Adam's, of steps of so many views."""
+    return BETAS[0] ** views, BETAS[1] ** views
 
 
 def set_learning_rates(
@@ -144,9 +170,28 @@ def _adam_rows(rows, parameter, gradient, first, second, numbers, share):
                 p[c] -= rate * mean / (np.sqrt(square) + epsilon)
 
 
+class AnchorRows(Protocol):
+    """A module whose parameters and buffers have a row for each anchor, some of them."""
+
+    coordinates: Tensor  # [N, 3] int32, voxels
+    mask: Tensor  # [N, K] bool: coupled primitives that exist
+
+    @property
+    def anchors(self) -> int: ...
+
+    @property
+    def anchor_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that have such rows."""
+        ...
+
+    def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]: ...
+
+    def get_submodule(self, target: str) -> nn.Module: ...
+
+
 @torch.no_grad()
 def replace_rows(
-    model: TrainedModel, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]
+    model: AnchorRows, optimizer: torch.optim.Adam, kept: Tensor, added: dict[str, Tensor]
 ) -> None:
     """Keep some anchors and append others, in the parameters and in Adam's moments (zero for new anchors).
 
@@ -167,7 +212,7 @@ def _joined(x: Tensor, kept: Tensor, rows: Tensor) -> Tensor:
 
 @torch.no_grad()
 def replace_parameter(
-    model: nn.Module,
+    model: nn.Module | AnchorRows,
     optimizer: torch.optim.Optimizer | None,
     old: Tensor,
     change: Callable[[Tensor], Tensor],

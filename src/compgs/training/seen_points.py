@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from compgs.cameras import Camera
 from compgs.errors import TrainingError
+from compgs.scene.sight import depths_in
 from compgs.scene.views import Scene
 
 LOOKED_AT = 10_000  # points, spread over all of them: a share needs no more
@@ -23,7 +23,7 @@ def check_points_seen(scene: Scene, near_plane: float) -> None:
     seen = np.zeros(len(positions), dtype=bool)
     depths = []
     for view in scene.train_views:
-        depth, inside = depths_in(view.camera, positions)
+        depth, inside = depths_in(view.camera, positions, MARGIN)
         seen |= inside
         depths.append(depth[inside])
     if seen.mean() < MIN_SEEN:
@@ -39,14 +39,3 @@ def check_points_seen(scene: Scene, near_plane: float) -> None:
             f"{scene.name}: {100 * too_near:.0f} % of what the training views see is nearer than {near_plane:g} world "
             f"units, and would not be drawn; scale camera positions and points up, {factor:g} times"
         )
-
-
-def depths_in(camera: Camera, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances [P] of positions [P, 3] along the camera's axis, world units; [P] bool: which are in its image."""
-    x, y, depth = (positions @ camera.rotation.T + camera.translation).T
-    ahead = depth > 0
-    safe = np.where(ahead, depth, 1.0)
-    column, row = camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy
-    across = (column > -MARGIN * camera.width) & (column < (1 + MARGIN) * camera.width)
-    down = (row > -MARGIN * camera.height) & (row < (1 + MARGIN) * camera.height)
-    return depth, ahead & across & down

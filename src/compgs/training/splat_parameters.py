@@ -11,7 +11,7 @@ from compgs.numerics.nearest import nearest
 from compgs.scene.views import Points
 from compgs.tensors.spherical_harmonics import coefficients, dc_from_color
 from compgs.tensors.splats import Splats
-from compgs.training.optimizers import ADAM_EPSILON, replace_parameter
+from compgs.training.optimizers import ADAM_EPSILON, betas_for, rates_for, replace_parameter
 
 NEIGHBOURS = 3  # of a point: their mean distance is the size of its splat
 SMALLEST_SCALE = 1e-7**0.5  # world units, of splats whose neighbours are in the same place (3DGS)
@@ -64,6 +64,7 @@ def make_splat_optimizer(
     parameters: SplatParameters,
     config: SplatConfig,
     extent: float,  # of the scene, world units
+    views: int = 1,  # of a step
 ) -> torch.optim.Adam:
     """One group a parameter, for `training.optimizers.set_learning_rates`: only positions slow down."""
     first, last = config.position_lr
@@ -75,12 +76,13 @@ def make_splat_optimizer(
         "dc": (config.color_lr, config.color_lr),
         "rest": (config.harmonics_lr, config.harmonics_lr),
     }
+    rates = {name: rates_for(views, pair) for name, pair in rates.items()}
     groups = [
         {"name": name, "params": [parameter], "lr": rates[name][0], "rates": rates[name]}
         for name, parameter in parameters.named_parameters()
         if parameter.numel() > 0
     ]
-    return torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
+    return torch.optim.Adam(groups, lr=1e-3, betas=betas_for(views), eps=ADAM_EPSILON, fused=True)
 
 
 @torch.no_grad()

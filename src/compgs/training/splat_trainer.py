@@ -7,7 +7,8 @@ quantization, no rate. Methods that compress splats build on it by `training/hoo
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -26,6 +27,7 @@ from compgs.scene.world import local_scene, world_offset
 from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
 from compgs.tensors.visibility import visible_mask
 from compgs.training.checkpoint import (
+    Writer,
     check_same_run,
     optimizer_tensors,
     read_checkpoint_file,
@@ -34,6 +36,7 @@ from compgs.training.checkpoint import (
     write_checkpoint_file,
 )
 from compgs.training.densification import DensityControl, densify_schedule
+from compgs.training.distributed import check_identical, leave_to_first, mine, sum_gradients, whole
 from compgs.training.hooks import Drawn, Hooks, hook_state, parameter_groups, restore_hooks
 from compgs.training.loop import (
     Run,
@@ -44,7 +47,7 @@ from compgs.training.loop import (
     rasterize_step,
     run_to_end,
 )
-from compgs.training.optimizers import exponential_decay, set_learning_rates
+from compgs.training.optimizers import exponential_decay, parameters_of, rates_for, set_learning_rates
 from compgs.training.profile import StepProfile
 from compgs.training.restoring import (
     check_moments,
@@ -114,7 +117,9 @@ class SplatTrainer:
         phase: int = 0,  # of the run, and the method whose run it is: checkpoints say them
         method: str = METHOD,
     ) -> None:
-        self.views = ViewsInTurn(scene, device, config.training.seed + 2, exposure=config.training.exposure)
+        t = config.training
+        per_step = t.views_per_step
+        self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure, per_step=per_step)
         self.world_offset = world_offset(scene) if start is None else start.world_offset
         scene = self.scene = local_scene(scene, self.world_offset)
         self.config = config
@@ -128,10 +133,10 @@ class SplatTrainer:
             else of_degree(Splats.of(start.splats), config.splats.harmonics)
         )
         self.parameters = SplatParameters(splats.to(device))
-        self.optimizer = make_splat_optimizer(self.parameters, config.splats, scene.extent)
-        self.schedule = densify_schedule(config.splats, config.training.steps, len(scene.train_views))
+        self.optimizer = make_splat_optimizer(self.parameters, config.splats, scene.extent, per_step)
+        self.schedule = densify_schedule(config.splats, t.steps, len(scene.train_views), per_step)
         self.control = DensityControl(config.splats, scene.extent, len(self.parameters), device)
-        self.chance = torch.Generator(device).manual_seed(config.training.seed + 1)  # of splits
+        self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of splits
         self.settings = RasterSettings(background=scene.background)
         self.step = 0
 
@@ -146,7 +151,7 @@ class SplatTrainer:
         self.hooks.to(self.device)
         for name, parameters in parameter_groups(self.hooks).items():
             if HOOKS + name not in there:
-                rates = self.hooks.rates[name]
+                rates = rates_for(self.config.training.views_per_step, self.hooks.rates[name])
                 group = {"name": HOOKS + name, "params": parameters, "lr": rates[0], "rates": rates}
                 self.optimizer.add_param_group(group)
 
@@ -163,15 +168,22 @@ class SplatTrainer:
     # one step ------------------------------------------------------------------------------------------------------
 
     def train_step(self) -> StepResult:
-        """Activate, rasterize, compare, pull; then control density."""
-        drawn = self.draw(self.views.next())
-        loss = self.compare(drawn)
-        self.backward(loss, drawn.rendered, drawn.gaussians)
-        self.update()
-        self.observe(drawn.rendered, drawn.camera)
+        """Activate, rasterize, compare, pull, for each view; then move, and control density."""
+        views = self.views.next()
+        results = [self.learn_from(view) for view in mine(views)]
+        loss = torch.stack([result.loss for result in results]).sum()
+        self.update(views, loss)
         self.step += 1
         self.control_density()
         self.hooks.after_step(self)
+        return replace(results[-1], loss=loss / len(views))
+
+    def learn_from(self, view: int) -> StepResult:
+        """The gradients of a view."""
+        drawn = self.draw(view)
+        loss = self.compare(drawn)
+        self.backward(loss, drawn.rendered, drawn.gaussians)
+        self.observe(drawn.rendered, drawn.camera)
         return StepResult(loss.detach(), drawn.rendered.image.detach(), drawn.photograph)
 
     @property
@@ -206,11 +218,20 @@ class SplatTrainer:
         """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
         loss.backward()
 
-    def update(self) -> None:
-        set_learning_rates(self.optimizer, self.progress, exponential_decay)
+    def update(self, views: Sequence[int], loss: Tensor) -> None:
+        """Adam's step after these views. Over the ranks gradients are summed, and the `loss` [], which becomes that of
+        all views.
+        """
+        exposures = self.views.exposure_gradients(views)
+        sum_gradients(parameters_of(self.optimizer), loss, *exposures)
+        set_learning_rates(self.optimizer, self.progress, self.learning_rate)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        self.views.learn(self.progress)
+        self.views.learn(self.progress, views, exposures)
+
+    def learning_rate(self, first: float, last: float, progress: float) -> float:
+        """Of a group, at some progress of the phase."""
+        return exponential_decay(first, last * self.hooks.slowing, progress)
 
     def observe(self, rendered: RasterResult, camera: Camera) -> None:
         if self.schedule.active(self.step) and rendered.means2d.grad is not None:
@@ -220,14 +241,21 @@ class SplatTrainer:
         """What the schedule asks for after so many steps."""
         if self.schedule.due(self.step):
             large = self.step > self.schedule.reset_every
-            kept, added, origins = self.control.chosen(
-                self.parameters.trained(), self.as_drawn(), self.chance, remove_large=large
-            )
-            self.replace(kept, added, origins)
-            self.control.forget(len(self.parameters))
+            with whole(self.control, DensityControl.STATISTICS):
+                kept, added, origins = self.control.chosen(
+                    self.parameters.trained(), self.as_drawn(), self.chance, remove_large=large
+                )
+                self.replace(kept, added, origins)
+                self.control.forget(len(self.parameters))
             self.hooks.densified(self)
+            self.check_ranks()
         if self.schedule.reset_due(self.step):
             reset_opacities(self.parameters, self.optimizer, self.config.splats.reset_opacity)
+
+    def check_ranks(self) -> None:
+        """Raises TrainingError if the ranks of a torchrun have come to hold different splats."""
+        own = {HOOKS + name: value for name, value in hook_state(self.hooks).items()}
+        check_identical(self.step, {**self.named_parameters(), **own})
 
     @torch.no_grad()
     def as_drawn(self) -> Splats:
@@ -257,6 +285,7 @@ class SplatTrainer:
     ) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         check_points_seen(self.scene, self.settings.near_plane)
+        self.check_ranks()
         run_to_end(self, self.config.training, path, on_progress, watch)
 
     def estimated_bytes(self) -> int:
@@ -281,7 +310,12 @@ class SplatTrainer:
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | None, writer: Writer | None = None) -> None:
+        with whole(self.control, DensityControl.STATISTICS):
+            if path is not None:
+                self.write(path, writer)
+
+    def write(self, path: Path, writer: Writer | None) -> None:
         tensors = {f"model/{name}": p for name, p in vars(self.parameters.trained()).items()}
         moments = optimizer_tensors(self.named_parameters(), self.optimizer)
         tensors |= {f"optimizer/{name}": value for name, value in moments.items()}
@@ -296,7 +330,7 @@ class SplatTrainer:
             "world_offset": self.world_offset,
         }
         metadata = {"config": json.dumps(self.config.to_dict()), "state": json.dumps(state)}
-        write_checkpoint_file(path, self.method, tensors, metadata)
+        write_checkpoint_file(path, self.method, tensors, metadata, writer)
 
     def named_parameters(self) -> dict[str, nn.Parameter]:
         """All that is trained."""
@@ -334,6 +368,7 @@ class SplatTrainer:
             check_moments(parts["optimizer"], trainer.named_parameters())
             restore_optimizer(trainer.named_parameters(), trainer.optimizer, parts["optimizer"])
             restore_statistics(trainer.control, DensityControl.STATISTICS, extra)
+            leave_to_first(trainer.control, DensityControl.STATISTICS)
             restore_chance(trainer.chance, extra)
             trainer.views.restore(state, extra)
             trainer.step = state["step"]

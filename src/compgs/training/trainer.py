@@ -1,8 +1,9 @@
 """Rate-distortion optimization of one scene (CompGS Sec. 3.4): a loop short enough to read aloud."""
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -29,9 +30,11 @@ from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
 from compgs.tensors.prediction import (
+    Geometry,
     Prediction,
     camera_center,
     choosing_pays,
+    geometry_of_all,
     predict,
     predict_geometry,
 )
@@ -39,6 +42,7 @@ from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
 from compgs.training.checkpoint import (
     Checkpoint,
+    Writer,
     check_same_run,
     load_checkpoint,
     optimizer_tensors,
@@ -48,6 +52,14 @@ from compgs.training.checkpoint import (
 from compgs.training.control import AdaptiveControl, make_schedule
 from compgs.training.culling import MEASURED_AT_ONCE, AnchorBounds
 from compgs.training.decorrelation import channel_rates, decorrelate, drop_silent_channels
+from compgs.training.distributed import (
+    check_identical,
+    leave_to_first,
+    mine,
+    sum_gradients,
+    sum_over_ranks,
+    whole,
+)
 from compgs.training.dropout import share_left_out, thinned
 from compgs.training.events import Event, at_shares
 from compgs.training.file_size import fixed_bytes, latent_bytes
@@ -63,11 +75,12 @@ from compgs.training.loop import (
     rasterize_step,
     run_to_end,
 )
-from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rates, step_rows
+from compgs.training.optimizers import DECAYS, make_optimizer, parameters_of, set_learning_rates, step_rows
 from compgs.training.profile import StepProfile
 from compgs.training.rate_control import RateState
 from compgs.training.restoring import check_tensor, restore_chance, restore_statistics, restoring
 from compgs.training.seen_points import check_points_seen
+from compgs.training.step_views import Noise, StepViews, step_views
 from compgs.training.target_size import TargetSize, pruned_share
 from compgs.training.views_in_turn import ViewsInTurn
 
@@ -122,13 +135,14 @@ class Trainer:
         self, scene: Scene, config: Config, device: torch.device, model: TrainedModel | None = None
     ) -> None:
         t, views = config.training, len(scene.train_views)
-        self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure)
+        per_step = t.views_per_step
+        self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure, per_step=per_step)
         self.config = config
         self.device = device
         self.model = (model or initial_model(scene, config)).to(device)
         self.scene = local_scene(scene, self.model.world_offset)
         self.optimizer = make_optimizer(self.model, t)
-        self.schedule = make_schedule(config.control, t.steps, views)
+        self.schedule = make_schedule(config.control, t.steps, views, per_step)
         self.bounds = AnchorBounds(self.model, self.geometry)
         self.control = AdaptiveControl(config, self.schedule, self.model.anchors, device)
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
@@ -150,21 +164,74 @@ class Trainer:
     # one step ------------------------------------------------------------------------------------------------------
 
     def train_step(self) -> StepResult:
-        """Quantize, predict, rasterize, compare, pull (the paper's Fig. 2 from left to right)."""
-        index = self.views.next()
-        camera, photograph = self.scene.train_views[index].camera, self.views.photograph(index)
-        rows = self.visible_anchors(camera)
-        if len(rows) == 0:
-            return self.skip(photograph)
-        latents = self.quantize(rows)
-        prediction, gaussians = self.predict_some(latents, rows, camera)
-        rendered = self.rasterize(gaussians, camera)
-        distortion = self.compare(rendered, photograph) + self.regularize(prediction, gaussians, camera)
-        loss = self.add_rate(distortion, latents)
-        self.backward(loss, rendered, gaussians, latents)
-        self.update(rows)
-        self.observe(rows, prediction, rendered, camera)
+        """Quantize, predict, rasterize, compare, pull (the paper's Fig. 2 from left to right); then move."""
+        looks = self.look()
+        if len(looks.seen.rows) == 0:
+            return self.skip(looks)
+        result = self.learn(looks)
+        loss = result.loss.clone()
+        self.update(looks, loss)
         self.finish_step()
+        return replace(result, loss=loss / len(looks.views))
+
+    def look(self) -> StepViews:
+        """The views of this step, and the anchors that they may show."""
+        views = self.views.next()
+        rows = [self.visible_anchors(self.scene.train_views[view].camera) for view in views]
+        return step_views(views, rows, self.model.anchors, self.noise)
+
+    def learn(self, looks: StepViews) -> StepResult:
+        """Gradients of this rank's views; the loss is the sum over them, the image that of the last."""
+        if len(looks.own.rows) == 0:
+            return self.nothing_shown(looks)
+        latents = self.quantize(looks)
+        shown = latents.cut()
+        with self.shared_geometry(shown, looks) as geometry:
+            results = [self.learn_from(shown, geometry, looks, number) for number in looks.own.numbers]
+        rate = self.rate_of(latents, looks)
+        self.pull(latents, shown, rate)
+        loss = torch.stack([result.loss for result in results]).sum()
+        if rate is not None and self.rate.lmbda > 0:
+            loss = rate_distortion_loss(loss, rate.detach(), self.rate.lmbda)
+        return replace(results[-1], loss=loss)
+
+    @contextmanager
+    def shared_geometry(self, shown: Quantized, looks: StepViews) -> Iterator[Geometry | None]:
+        """Where several views are looked at: the geometry of their primitives, predicted once. After them its gradients
+        go on to the latents and the heads. A single view predicts that of what it shows.
+        """
+        if len(looks.own.numbers) == 1:
+            yield None
+            return
+        geometry = self.predict_shared(shown, looks.own.rows)
+        cut = geometry.cut()
+        yield cut
+        pull_back(geometry.tensors(), cut.tensors())
+
+    def predict_shared(self, shown: Quantized, rows: Tensor) -> Geometry:
+        heads, primitives = self.model.heads, self.model.primitives(shown, rows)
+        if not self.stored:
+            return geometry_of_all(heads, primitives)
+        weights = self.model.stored_head_weights()
+        found: Geometry = torch.func.functional_call(heads, weights, (geometry_of_all, primitives))
+        return found
+
+    def learn_from(
+        self, shown: Quantized, geometry: Geometry | None, looks: StepViews, number: int
+    ) -> StepResult:
+        """One of the step's views: its gradients by the latents, the heads and its exposure."""
+        view, part = looks.views[number], looks.own.part_of(number)
+        camera, photograph = self.scene.train_views[view].camera, self.views.photograph(view)
+        rows = looks.own.rows_of(number)
+        if geometry is not None:
+            geometry = geometry.of(None if part is None else self.model.slots(part))
+        prediction, gaussians = self.predict_some(
+            shown.of(part), rows, camera, looks.noise_of_view(number), geometry
+        )
+        rendered = self.rasterize(gaussians, camera)
+        loss = self.compare(rendered, photograph) + self.regularize(prediction, gaussians, camera)
+        self.backward(loss, rendered, gaussians)
+        self.observe(rows, prediction, rendered, camera)
         return StepResult(loss.detach(), rendered.image.detach(), photograph)
 
     @property
@@ -178,13 +245,13 @@ class Trainer:
         positions, radii = self.model.positions(), self.bounds.radii()
         return torch.nonzero(visible_mask(positions, radii, camera, self.settings)).view(-1)
 
-    def quantize(self, rows: Tensor) -> Quantized:
+    def quantize(self, looks: StepViews) -> Quantized:
         """Latents of the anchors in view as the decoder will have them, and their bits (Sec. 3.3)."""
         t = self.config.training
         return self.model.quantized(
-            rows,
+            looks.own.rows,
             rate=self.progress >= t.rate_start,
-            noise=self.noise if self.progress < t.hard_rate else None,
+            noise=looks.noise_of_latents() if self.progress < t.hard_rate else None,
             stored_weights=self.stored,
         )
 
@@ -193,12 +260,21 @@ class Trainer:
         """Whether this late in the run the networks compute with weights rounded as the file will hold them."""
         return self.progress >= self.config.training.quantized_weights
 
-    def predict_some(self, latents: Quantized, rows: Tensor, camera: Camera) -> tuple[Prediction, Gaussians]:
+    def predict_some(
+        self, latents: Quantized, rows: Tensor, camera: Camera, noise: Noise, geometry: Geometry | None
+    ) -> tuple[Prediction, Gaussians]:
         """What the view may show (Sec. 3.2), and its Gaussians without those that chance leaves out of this step."""
-        prediction = self.predict(latents, rows, camera, self.stored)
-        return prediction, thinned(prediction, self.left_out, self.noise)
+        prediction = self.predict(latents, rows, camera, self.stored, geometry)
+        return prediction, thinned(prediction, self.left_out, noise)
 
-    def predict(self, latents: Quantized, rows: Tensor, camera: Camera, stored: bool) -> Prediction:
+    def predict(
+        self,
+        latents: Quantized,
+        rows: Tensor,
+        camera: Camera,
+        stored: bool,
+        geometry: Geometry | None = None,
+    ) -> Prediction:
         """On the GPU all primitives of the anchors in view: to choose among them the CPU would have to wait for it."""
         model = self.model
         return predict(
@@ -209,6 +285,7 @@ class Trainer:
             model.stored_head_weights() if stored else None,
             compact=choosing_pays(self.device),
             appearance_dtype=getattr(torch, self.config.training.appearance_dtype),
+            geometry=geometry,
         )
 
     def rasterize(self, gaussians: Gaussians, camera: Camera) -> RasterResult:
@@ -223,35 +300,47 @@ class Trainer:
         volumes = scale_regularizer(gaussians.scales / unit, prediction.drawn)
         return self.config.training.scale_weight * volumes + vanishing_loss(prediction)
 
-    def add_rate(self, distortion: Tensor, latents: Quantized) -> Tensor:
-        """D + lambda R (Eq. 1), once the rate has joined the loss; with lambda 0 only the entropy model learns R."""
+    def rate_of(self, latents: Quantized, looks: StepViews) -> Tensor | None:
+        """R of Eq. 1, summed over this rank's views; None before the rate joins the loss."""
         if not latents.bits:
-            return distortion
-        r = rate(latents.bits, self.model.entropy.channels, self.config.training.rate)
-        if self.rate.lmbda > 0:
-            return rate_distortion_loss(distortion, r, self.rate.lmbda)
-        r.backward(inputs=self.model.entropy.statistics(), retain_graph=True)
-        return distortion
+            return None
+        channels, normalization = self.model.entropy.channels, self.config.training.rate
+        parts = [latents.of(looks.own.part_of(number)).bits for number in looks.own.numbers]
+        return torch.stack([rate(bits, channels, normalization) for bits in parts]).sum()
 
-    def backward(
-        self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians, latents: Quantized
-    ) -> None:
-        """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
+    def backward(self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians) -> None:
+        """Compute a view's gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
         loss.backward()
 
-    def update(self, rows: Tensor) -> None:
-        """Adam's step, after a view of the anchors in `rows`; each channel of the references by its own rate."""
+    def pull(self, latents: Quantized, shown: Quantized, rate: Tensor | None) -> None:
+        """D + lambda R (Eq. 1): what the views ask of the latents, and what the rate does, through the entropy model to
+        the anchors. With lambda 0 only the entropy model learns R.
+        """
+        if rate is not None and self.rate.lmbda > 0:
+            rate = self.rate.lmbda * rate
+        elif rate is not None:
+            rate.backward(inputs=self.model.entropy.statistics(), retain_graph=True)
+            rate = None
+        pull_back(latents.latents(), shown.latents(), rate)
+
+    def update(self, looks: StepViews, loss: Tensor) -> None:
+        """Adam's step, after views of the anchors in `looks`; each channel of the references by its own rate.
+
+        Over the ranks gradients are summed, and the `loss` [], which becomes that of all views.
+        """
         t = self.config.training
+        exposures = self.views.exposure_gradients(looks.views)
+        sum_gradients(parameters_of(self.optimizer), loss, *exposures)
         set_learning_rates(self.optimizer, self.progress, DECAYS[t.schedule], t.head_warm_up)
         references, rates = self.model.references.detach(), self.reference_rates
         before = references.clone() if rates is not None else references
         if t.sparse_adam:
-            step_rows(self.model, self.optimizer, rows)
+            step_rows(self.model, self.optimizer, looks.seen.rows)
         self.optimizer.step()
         if rates is not None:
             references.copy_(before.lerp_(references, rates))
         self.optimizer.zero_grad(set_to_none=True)
-        self.views.learn(self.progress)
+        self.views.learn(self.progress, looks.views, exposures)
 
     def observe(self, rows: Tensor, prediction: Prediction, rendered: RasterResult, camera: Camera) -> None:
         """The statistics that growth and pruning go by."""
@@ -264,21 +353,33 @@ class Trainer:
             if event.due(self.step):
                 event.act()
                 self.bounds.forget()
+                self.check_ranks()
         self.step += 1
         self.bounds.after_step(self.step)
         self.rate = self.target_size.follow(self.rate, self.step)
 
-    def skip(self, photograph: Target) -> StepResult:
-        """A step on a view that no anchor is in: nothing can be learned from it."""
+    def skip(self, looks: StepViews) -> StepResult:
+        """A step on views that no anchor is in: nothing can be learned from it."""
         self.finish_step()
+        return self.nothing_shown(looks)
+
+    def nothing_shown(self, looks: StepViews) -> StepResult:
+        photograph = self.views.photograph(mine(looks.views)[-1])
         background = torch.tensor(self.scene.background, device=self.device)
-        return StepResult(torch.zeros(()), background.expand(*photograph.image.shape), photograph)
+        loss = torch.zeros((), device=self.device)
+        return StepResult(loss, background.expand(*photograph.image.shape), photograph)
+
+    def check_ranks(self) -> None:
+        """Raises TrainingError if the ranks of a torchrun have come to hold different models."""
+        lmbda = torch.tensor(self.rate.lmbda, dtype=torch.float64)
+        check_identical(self.step, {**self.model.state_dict(), "lambda": lmbda})
 
     # events --------------------------------------------------------------------------------------------------------
 
     def grow(self) -> None:
         """Add anchors where the image's gradient is large, and remove those that nobody sees."""
-        self.control.act(self.model, self.optimizer, self.coupled_means(), self.chance, self.rate.lmbda)
+        with whole(self.control, AdaptiveControl.STATISTICS):
+            self.control.act(self.model, self.optimizer, self.coupled_means(), self.chance, self.rate.lmbda)
 
     @torch.no_grad()
     def coupled_means(self) -> Tensor:
@@ -319,8 +420,10 @@ class Trainer:
             return rows, self.predict(self.model.quantized(rows), rows, camera, stored=True)
 
         shape = self.model.anchors, self.model.dimensions.coupled_primitives
-        views = spread(self.scene.train_views, most)
-        return view_contributions(views, predicted, shape, self.settings, self.device)
+        views = mine(spread(self.scene.train_views, most))
+        total = view_contributions(views, predicted, shape, self.settings, self.device)
+        sum_over_ranks(total)
+        return total
 
     # the run -------------------------------------------------------------------------------------------------------
 
@@ -332,6 +435,7 @@ class Trainer:
     ) -> None:
         """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
         check_points_seen(self.scene, self.settings.near_plane)
+        self.check_ranks()
         run_to_end(self, self.config.training, path, on_progress, watch)
 
     def snapshot(self) -> HybridModel:
@@ -363,7 +467,12 @@ class Trainer:
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | None, writer: Writer | None = None) -> None:
+        with whole(self.control, AdaptiveControl.STATISTICS):
+            if path is not None:
+                self.write(path, writer)
+
+    def write(self, path: Path, writer: Writer | None) -> None:
         extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
         extra["chance"] = self.chance.get_state()
         extra |= self.views.tensors()
@@ -377,7 +486,7 @@ class Trainer:
             "rate": asdict(self.rate),
         }
         moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
-        save_checkpoint(path, Checkpoint(self.model, moments, extra, state))
+        save_checkpoint(path, Checkpoint(self.model, moments, extra, state), writer)
 
     @classmethod
     def resumed(cls, scene: Scene, path: Path, config: Config, device: torch.device) -> "Trainer":
@@ -389,6 +498,7 @@ class Trainer:
         with restoring(path):
             restore_optimizer(dict(trainer.model.named_parameters()), trainer.optimizer, checkpoint.optimizer)
             restore_statistics(trainer.control, AdaptiveControl.STATISTICS, checkpoint.extra)
+            leave_to_first(trainer.control, AdaptiveControl.STATISTICS)
             if any(at < checkpoint.state["step"] for at in trainer.decorrelated_at):
                 rates = checkpoint.extra["reference_rates"]
                 check_tensor(rates, (trainer.model.reference_dim,), torch.float32, "reference_rates")
@@ -402,6 +512,19 @@ class Trainer:
             trainer.step = checkpoint.state["step"]
             trainer.rate = RateState.restored(checkpoint.state["rate"])
         return trainer
+
+
+def pull_back(tensors: Sequence[Tensor], leaves: Sequence[Tensor], loss: Tensor | None = None) -> None:
+    """Lead the gradients of `leaves`, which were cut from the `tensors`, and those of a `loss` [] on through the graph
+    of these.
+    """
+    asked: list[tuple[Tensor, Tensor | None]]
+    asked = [
+        (tensor, leaf.grad) for tensor, leaf in zip(tensors, leaves, strict=True) if leaf.grad is not None
+    ]
+    if loss is not None:
+        asked.append((loss, None))
+    torch.autograd.backward([tensor for tensor, _ in asked], [gradient for _, gradient in asked])
 
 
 def vanishing_loss(prediction: Prediction) -> Tensor | float:
@@ -418,11 +541,13 @@ def vanishing_loss(prediction: Prediction) -> Tensor | float:
 PARTS = {
     "visible_anchors": "culling",
     "quantize": "entropy",
+    "predict_shared": "prediction",
     "predict_some": "prediction",
     "rasterize": "projection and rasterization",
     "regularize": "loss",
-    "add_rate": "entropy",
-    "backward": "entropy, backward",
+    "backward": "prediction, backward",
+    "rate_of": "entropy",
+    "pull": "entropy, backward",
     "update": "optimizer",
     "observe": "control",
     "finish_step": "control",
@@ -430,10 +555,9 @@ PARTS = {
 
 
 def stations(
-    loss: Tensor, rendered: RasterResult, gaussians: Gaussians, latents: Quantized
+    loss: Tensor, rendered: RasterResult, gaussians: Gaussians
 ) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
-    """Where the gradients of a step arrive, part by part."""
+    """Where the gradients of a view arrive, part by part; the rest is the prediction's."""
     yield "loss, backward", (rendered.image,)
     yield "rasterization, backward", (rendered.means2d,)
     yield "projection, backward", (gaussians.means, gaussians.quaternions, gaussians.scales)
-    yield "prediction, backward", (latents.references, latents.residuals, latents.covariances)

@@ -1,4 +1,10 @@
-"""The training views of a run: each once in random order, then again; and their photographs on the device."""
+"""The training views of a run: each once in random order, then again; and their photographs on the device.
+
+With V views a step there are V lanes: every V-th view is in the same lane, and each step takes one view of each lane,
+in the lane's own random order. A lane belongs to one rank (`distributed`), so that no rank reads the photographs of
+the others. Lanes do not depend on how many ranks there are. Where they are not equally long, the views of the shorter
+ones come a little more often.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,6 +17,7 @@ from torch import Tensor
 from compgs.errors import ConfigError
 from compgs.losses import Target
 from compgs.scene.views import Scene, View
+from compgs.training.distributed import world
 from compgs.training.exposures import Exposures
 
 KEPT_BYTES = 8 << 30  # of photographs on a GPU, 3 bytes a pixel
@@ -19,24 +26,46 @@ KEPT_BYTES = 8 << 30  # of photographs on a GPU, 3 bytes a pixel
 class ViewsInTurn:
     """Which view comes next. The order is random and belongs to the state of a run."""
 
-    def __init__(self, scene: Scene, device: torch.device, seed: int, *, exposure: bool = False) -> None:
-        """`exposure`: learn one for each view. Raises ConfigError for a scene without training views."""
+    def __init__(
+        self, scene: Scene, device: torch.device, seed: int, *, exposure: bool = False, per_step: int = 1
+    ) -> None:
+        """`exposure`: learn one for each view; `per_step`: views of a step, of all ranks.
+
+        Raises ConfigError for a scene without training views, or with fewer than a step needs, and for a step of fewer
+        views than there are ranks.
+        """
         if not scene.train_views:
             raise ConfigError(f"{scene.name}: no training views are left after holding out the test views")
+        if per_step > len(scene.train_views):
+            raise ConfigError(
+                f"training.views_per_step = {per_step}: {scene.name} has {len(scene.train_views)} training views"
+            )
+        if per_step < world():
+            raise ConfigError(
+                f"training.views_per_step = {per_step}: {world()} processes need a view each; set it to {world()} or a "
+                f"multiple, and divide training.steps by it"
+            )
         self.views: Sequence[View] = scene.train_views
+        self.per_step = per_step
         self.device = device
         self.chance = np.random.default_rng(seed)
-        self.order: list[int] = []  # the views still to come in this round, taken from its end
+        self.order: list[int] = []  # the views still to come in this round of their lane, taken from the end
         self.photographs: dict[int, Target] = {}  # on a GPU
         self.exposures = Exposures(len(self.views), device) if exposure else None
 
     def __len__(self) -> int:
         return len(self.views)
 
-    def next(self) -> int:
-        """Index of the next view."""
-        if not self.order:
-            self.order.extend(int(i) for i in self.chance.permutation(len(self.views)))
+    def next(self) -> list[int]:
+        """Indices of the next step's views, one of each lane."""
+        return [self._next_of(lane) for lane in range(self.per_step)]
+
+    def _next_of(self, lane: int) -> int:
+        waiting = [place for place, view in enumerate(self.order) if view % self.per_step == lane]
+        if waiting:
+            return self.order.pop(waiting[-1])
+        views = np.arange(lane, len(self.views), self.per_step)
+        self.order.extend(int(i) for i in views[self.chance.permutation(len(views))])
         return self.order.pop()
 
     def photograph(self, index: int) -> Target:
@@ -44,10 +73,14 @@ class ViewsInTurn:
         target = self.stored(index)
         return target if self.exposures is None else replace(target, exposure=self.exposures.of(index))
 
-    def learn(self, progress: float) -> None:
-        """After the gradients of a step were computed: the exposure of its view; `progress` of the run, 0 to 1."""
+    def exposure_gradients(self, views: Sequence[int]) -> tuple[Tensor, ...]:
+        """Of a step's views, as far as this rank rendered them, the others 0: to be summed over the ranks."""
+        return () if self.exposures is None else (self.exposures.gradients(views),)
+
+    def learn(self, progress: float, views: Sequence[int], gradients: Sequence[Tensor]) -> None:
+        """The exposures of a step's views, from `exposure_gradients`; `progress` of the run, 0 to 1."""
         if self.exposures is not None:
-            self.exposures.learn(progress)
+            self.exposures.learn(progress, views, gradients[0])
 
     def stored(self, index: int) -> Target:
         """On the CPU it shares the memory of the view's image, which the scene keeps or reads again; it is copied to a

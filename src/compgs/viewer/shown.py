@@ -9,7 +9,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.evaluation.camera_path import orbit
-from compgs.formats import format_of, open_scene
+from compgs.formats import component_bytes, format_of, open_scene, scene_file, scene_name
 from compgs.render import Renderable
 
 if TYPE_CHECKING:
@@ -63,15 +63,15 @@ class FileShown:
     """A file, or a beginning of it. Raises BitstreamError, SplatFileError."""
 
     def __init__(self, path: Path, device: str, background: Vector | None = None) -> None:
-        self.path = path
+        path = self.path = scene_file(path)
         self.device = device
         self.whole = open_scene(path, device, background or (0.0, 0.0, 0.0))
         self.background = background or self.whole.background
         self.world_offset = self.whole.world_offset
         self.up: Vector = getattr(self.whole, "up", USUAL_UP)
-        self.title = path.name
+        self.title = scene_name(path)
         self._prefixes = _prefixes(path)
-        everything = f"all of it: {_in_words(path.stat().st_size)}"
+        everything = f"all of it: {_in_words(sum(component_bytes(path).values()))}"
         self.levels = (*(words for _, words in self._prefixes), everything)
         cameras = self.whole.viewpoints
         self.cameras = tuple((f"camera {i}", camera) for i, camera in enumerate(cameras)) or (

@@ -1,0 +1,50 @@
+"""Settings that methods with such anchors have beside those of `compgs.config`."""
+
+from dataclasses import dataclass
+
+from compgs.config import LearningRates
+
+# What they use of `compgs.config`.
+ANCHOR_SETTINGS = (
+    "anchors",
+    "model.coupled_primitives",
+    "model.reference_dim",
+    "model.width",
+    "model.voxel_size",
+    "model.voxel_spacings",
+    "model.max_anchors",
+    "control.start",
+    "control.stop",
+    "control.every",
+    "control.gradient_threshold",
+    "control.minimum_views",
+    "control.minimum_share",
+    "control.opacity_threshold",
+    "control.opacity_views",
+    "control.opacity_share",
+    "control.reset_all",
+    "control.growth_probabilities",
+    "control.finer_needs_coarser",
+    "training.steps",
+    "training.seed",
+    "training.ssim_weight",
+    "training.scale_weight",
+    "training.log_scale_lr",
+    "training.covariance_lr",
+    "training.opacity_lr",
+    "training.color_lr",
+    "training.schedule",
+    "training.head_warm_up",
+    "training.exposure",
+    "training.checkpoint_minutes",
+)
+
+
+@dataclass(frozen=True)
+class AnchorSection:
+    """Learning rates of what only these anchors have."""
+
+    # of features (Scaffold-GS: 0.0075 for 30 000 steps; here as far as the default preset's in a short run)
+    feature_lr: LearningRates = (0.0165, 1e-4)
+    # of offsets, in units of the position scale (Scaffold-GS)
+    offset_lr: LearningRates = (0.01, 1e-4)

@@ -1,0 +1,41 @@
+"""What the pages say of the code is there: files, names in them, packages; and summaries are whole sentences."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import compgs
+from compgs import config
+from compgs.cli.main import COMMANDS
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCE = Path(compgs.__file__).parent
+
+
+def test_every_file_and_name_on_the_map_of_the_paper_exists() -> None:
+    page = (ROOT / "docs" / "paper_map.md").read_text(encoding="utf-8")
+    mentioned = re.findall(r"`([\w/]+\.(?:py|md))(?:: ([\w.]+))?`", page)
+    assert len(mentioned) > 30
+    for path, name in mentioned:
+        found = next((root / path for root in (SOURCE, ROOT) if (root / path).is_file()), None)
+        assert found is not None, path
+        last = name.rpartition(".")[2]
+        # A name is a class, a function, or an attribute that is assigned.
+        assert not name or re.search(rf"\b(class|def) {last}\b|\b{last}\b.* = ", found.read_text()), (
+            path,
+            name,
+        )
+
+
+def test_every_package_stands_in_the_table_for_contributors() -> None:
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    told = re.findall(r"^\| `(\w+)` \|", page, flags=re.MULTILINE)
+    there = [path.name for path in SOURCE.iterdir() if path.is_dir() and any(path.glob("*.py"))]
+    assert sorted(told) == sorted(there)
+
+
+def test_the_first_line_of_each_command_and_section_is_a_sentence() -> None:
+    sections = [field.type for field in dataclasses.fields(config.Config)]
+    for kind in (*COMMANDS, *sections):
+        summary = (kind.__doc__ or "").partition("\n")[0]
+        assert summary.endswith("."), (kind, summary)
