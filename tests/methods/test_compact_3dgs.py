@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import compgs
 from compgs.errors import SplatFileError
 from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import Packed, read, write_packed
@@ -22,7 +23,7 @@ from compgs.render import Renderable, render
 from compgs.scene.views import Scene
 from compgs.training import SplatTrainer
 
-from .quick import check_continues_exactly, quick
+from .quick import quick
 
 SMALL = {"grid_levels": 4, "grid_bits": 6, "grid_growth": 2.0, "grid_base": 2, "mask_lr": 0.1}
 LAYOUT = GridLayout(levels=4, features=2, base=2, growth=2.0, table_bits=6)
@@ -104,9 +105,15 @@ def test_the_file_shows_what_the_training_drew(blob_scene: Scene) -> None:
     )
 
 
-@pytest.mark.parametrize("stop", [20, 40])
-def test_a_run_that_was_stopped_continues_exactly(stop: int, blob_scene: Scene, tmp_path: Path) -> None:
-    check_continues_exactly("compact-3dgs", small(codes=8, codes_start=0.4), blob_scene, stop, tmp_path)
+def test_a_run_that_was_stopped_continues_exactly(check_continues: Any) -> None:
+    check_continues("compact-3dgs", small(codes=8, codes_start=0.4), (10, 30))
+
+
+def test_what_holds_no_lasting_splats_is_neither_exported_nor_compressed(file: Path, tmp_path: Path) -> None:
+    for convert in (compgs.export, compgs.compress):
+        with pytest.raises(SplatFileError, match=r"a\.packed: its splats are made anew for each camera"):
+            convert(file, tmp_path / ("b.ply" if convert is compgs.export else "b.cgs"))
+    assert not list(tmp_path.iterdir())
 
 
 def changed(file: Path, path: Path, facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> Path:
@@ -254,6 +261,10 @@ def test_colors_learn_by_thirds(blob_scene: Scene) -> None:
         assert rates["hooks/grid"] == rates["hooks/weights_0"]
         seen.append(rates["hooks/grid"])
     assert seen == pytest.approx([0.01, 0.0033, 0.001089, 0.00035937])
+    four, hooks = trainer(blob_scene, training={"views_per_step": 4})
+    hooks.view(blob_scene.train_views[0].camera, four.views.photograph(0), four)
+    rates = {group["name"]: group["rates"][0] for group in four.optimizer.param_groups}
+    assert rates["hooks/grid"] == pytest.approx(0.02), "as those of all other parameters"
 
 
 def test_codebooks_begin_late_and_what_they_miss_shrinks(blob_scene: Scene) -> None:

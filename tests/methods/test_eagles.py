@@ -21,7 +21,7 @@ from compgs.render import render
 from compgs.scene.views import Scene
 from compgs.training import SplatTrainer
 
-from .quick import check_continues_exactly, quick
+from .quick import quick
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +85,8 @@ def test_the_file_holds_what_was_drawn(blob_scene: Scene) -> None:
     assert drawn.rest.abs().max() > 1e-3
 
 
-@pytest.mark.parametrize("stop", [10, 20])
-def test_a_run_that_was_stopped_continues_exactly(stop: int, blob_scene: Scene, tmp_path: Path) -> None:
-    check_continues_exactly("eagles", quick("eagles"), blob_scene, stop, tmp_path)
+def test_a_run_that_was_stopped_continues_exactly(check_continues: Any) -> None:
+    check_continues("eagles", quick("eagles"), (10, 20))
 
 
 def test_splats_without_harmonics_have_no_latents_of_them(blob_scene: Scene, tmp_path: Path) -> None:
@@ -141,6 +140,11 @@ def test_latents_learn_slower_the_larger_their_decoder_but_for_opacities(blob_sc
     assert later["hooks/opacity_latents"] == pytest.approx(0.1 * 0.05)
     size = float(torch.linalg.norm(hooks.rotation_decoder.detach()))
     assert later["hooks/rotation_latents"] == pytest.approx(0.1 * 1e-3 / size)
+    # Steps of four views are twice as long, as those of all other parameters.
+    four, hooks = trainer(blob_scene, training={"views_per_step": 4})
+    hooks.view(blob_scene.train_views[0].camera, four.views.photograph(0), four)
+    rates = {group["name"]: group["rates"][0] for group in four.optimizer.param_groups}
+    assert rates["hooks/opacity_latents"] == pytest.approx(2 * 0.1 * 0.05)
 
 
 def test_images_grow_from_coarse_to_fine(blob_scene: Scene) -> None:

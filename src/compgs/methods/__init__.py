@@ -60,6 +60,7 @@ from compgs.methods.eagles import EAGLES
 from compgs.methods.lightgaussian import LIGHTGAUSSIAN
 from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
+from compgs.methods.scaffold_gs import SCAFFOLD_GS
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -73,6 +74,7 @@ METHODS: dict[str, Method] = {
         LIGHTGAUSSIAN,
         EAGLES,
         COMPACT_3DGS,
+        SCAFFOLD_GS,
         COSA,
     )
 }
