@@ -19,7 +19,7 @@ from compgs.errors import BitstreamError, ConfigError, CorruptSection, NotACompG
 from compgs.evaluation.camera_path import look_at, orbit
 from compgs.formats import check_scene, component_bytes, format_of, open_scene, open_tiles
 from compgs.formats.tiled import Core, GroundAxes, read_manifest
-from compgs.formats.tiled_scene import ASKED_BY, TiledScene, resident_bytes, tile_memory
+from compgs.formats.tiled_scene import ASKED_BY, TileCache, TiledScene, resident_bytes, tile_memory
 from compgs.formats.tiled_writer import NewTile, common_offset, spheres, write_tiles
 from compgs.gaussians import Gaussians
 from compgs.render import RasterSettings, Renderable, rasterize, render
@@ -127,6 +127,15 @@ def test_a_picture_with_more_tiles_than_fit_finds_most_of_them_open_the_next_tim
         assert model.cache.reads <= already + 2
 
 
+def test_a_tile_that_takes_more_than_was_said_still_makes_room(folder: Path) -> None:
+    model = open_tiles(folder / "manifest.json")
+    tile = model.manifest.tiles[0].memory
+    cache = TileCache(model.cache.get, [1] * 4, 2 * tile)
+    for index in (0, 1, 2):
+        cache.get(index)
+    assert cache.bytes == 2 * tile and [index in cache for index in range(4)] == [False, True, True, False]
+
+
 def test_two_halves_of_a_file_show_what_the_file_shows(
     cgs_bytes: bytes, tmp_path: Path, cameras: list[Camera]
 ) -> None:
@@ -192,6 +201,8 @@ def test_a_manifest_is_read_as_it_was_written(folder: Path, contents: list[bytes
     assert manifest.tiles[0].sha256 == hashlib.sha256(contents[0]).hexdigest()
     assert len(manifest.viewpoints) == len(open_scene(tmp_path / "x.tiles" / "a.cgs").viewpoints) > 0
     four = read_manifest(folder / "manifest.json")
+    assert len(four.viewpoints) == 12
+    np.testing.assert_allclose(four.up, open_scene(folder / "0_0.cgs").up, atol=1e-12)
     first = [open_scene(folder / f"{name}.cgs").viewpoints[0] for name in ("0_0", "1_0", "0_1", "1_1")]
     for kept, camera in zip(four.viewpoints, first, strict=False):  # in turns, the best of each tile first
         np.testing.assert_allclose(kept.world_to_camera, camera.world_to_camera, rtol=1e-11, atol=1e-12)
@@ -272,6 +283,17 @@ def test_a_manifest_of_nonsense_is_refused_also_where_its_checksum_matches(
     forged(copy, **changes)
     with pytest.raises(CorruptSection, match="manifest is damaged"):
         open_scene(copy)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"anchors": 5}, {"coupled_primitives": 5}, {"world_offset": [0.0, 0.0, 1.0]}]
+)
+def test_a_file_that_holds_another_scene_than_the_manifest_says_is_refused(
+    copy: Path, changes: dict[str, object]
+) -> None:
+    forged(copy, **changes)
+    with pytest.raises(CorruptSection, match="holds another scene than the manifest says"):
+        open_tiles(copy / "manifest.json").cache.get(0)
 
 
 def test_a_tile_that_is_missing_cut_or_another_is_refused_by_name(copy: Path, cameras: list[Camera]) -> None:

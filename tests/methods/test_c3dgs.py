@@ -235,6 +235,27 @@ def test_fine_tuning_gains_over_what_codebooks_lose(
     assert 20 < len(trainer.hooks.dc) < 140, "some are"  # type: ignore[arg-type]
 
 
+def test_positions_count_from_the_middle_and_rates_are_those_of_the_run(
+    blob_scene: Scene, plain: SplatModel
+) -> None:
+    config = settings()
+    begun = SplatTrainer(blob_scene, config, torch.device("cpu"), plain, SharedEntries(config))
+    begun.begin()
+    median = begun.parameters.means.detach().median(0).values
+    assert torch.equal(begun.hooks.center, median)  # type: ignore[arg-type]
+    drawn = begun.as_drawn().means
+    assert torch.equal(drawn, median + (begun.parameters.means.detach() - median).half().float())
+    rates = {group["name"]: group["rates"] for group in begun.optimizer.param_groups}
+    for entry, own in (
+        ("dc", "dc"),
+        ("rest", "rest"),
+        ("scales", "log_scales"),
+        ("log_factors", "log_scales"),
+        ("quaternions", "quaternions"),
+    ):
+        assert rates[f"hooks/{entry}"] == rates[own]
+
+
 def test_a_run_that_was_stopped_continues_exactly(
     check_continues: Callable[..., None], plain: SplatModel
 ) -> None:

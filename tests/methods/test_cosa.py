@@ -11,6 +11,7 @@ import torch
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.config import Config
 from compgs.errors import CompGSError, NotEncodable, SplatFileError
+from compgs.exporting import export
 from compgs.formats import component_bytes, open_scene, packed
 from compgs.methods import METHODS, settings_of, train, write
 from compgs.methods.cosa import reader
@@ -327,6 +328,11 @@ def test_facts_that_no_encoder_writes_are_refused(name: str, value: Any, content
     facts = {**content.facts, name: value}
     with pytest.raises(SplatFileError, match=f"{name}|step or unit|context|networks"):
         reader.content_of(replace(content, facts={k: v for k, v in facts.items() if v is not None}))
+
+
+def test_its_networks_are_not_exported(file: Path, tmp_path: Path) -> None:
+    with pytest.raises(SplatFileError, match=r"a\.packed: its splats are made anew for each camera"):
+        export(file, tmp_path / "a.ply")
 
 
 def test_a_damaged_file_is_refused_by_its_checksum(file: Path) -> None:

@@ -99,6 +99,21 @@ def test_tiles_are_padded_by_a_fifth_of_what_their_points_cover(street: Scene) -
     assert left.padded.low == left.core.low == (-math.inf, -math.inf)
 
 
+def test_margins_reach_no_farther_than_a_fifth_of_the_points() -> None:
+    """Most of the points in a small heap, some far away, which say how long the sides of the outer tiles are."""
+    rng = np.random.default_rng(6)
+    heap, far = rng.uniform(-1, 1, (3000, 3)), rng.uniform(-100, 100, (1000, 3))
+    camera = camera_at((0, 150, 20), (0, 0, 0))
+    scene = scene_of(np.concatenate([heap, far]) * np.array([1.5, 1, 0.1]), {"a": camera, "b": camera})
+    plan = plan_tiles(scene, 2, 1)
+    places = plan.ground.places(scene.points.positions)
+    for tile in plan.tiles:
+        beyond = contains(tile.padded, places).sum() - tile.points
+        assert beyond == pytest.approx(0.2 * tile.points, abs=2)
+    across = plan_tiles(scene, 1, 2)
+    assert all(t.padded.low[0] == -math.inf and t.padded.high[0] == math.inf for t in across.tiles)
+
+
 def test_cuts_give_parts_of_equal_weight() -> None:
     rng = np.random.default_rng(3)
     values, weights = rng.normal(size=5000), rng.integers(0, 10, 5000)

@@ -13,6 +13,8 @@ import pytest
 from compgs import extras
 from compgs.cli import train as train_command
 from compgs.cli.main import main
+from compgs.cli.tiles import _compute as options_of_tiles
+from compgs.cli.train import Train
 from compgs.formats import component_bytes, open_scene
 from compgs.formats.tiled import read_manifest
 from compgs.formats.tiled_scene import ASKED_BY, TiledScene
@@ -339,6 +341,22 @@ def test_options_that_do_not_go_together_are_refused_before_anything_is_made(
     assert main(["train", str(scene), "-o", str(tmp_path / "out"), *options, "--steps", "1"]) == 2
     assert message in capsys.readouterr().err.replace("\n", " ")
     assert not (tmp_path / "out").exists() and not runs.calls
+
+
+def test_processes_of_a_torchrun_do_not_train_tiles(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("compgs.cli.tiles.several", lambda: True)
+    assert main(["train", str(scene), "-o", str(tmp_path / "out"), "--tiles", "2x1"]) == 2
+    assert "torchrun's processes share one training" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_tiles_on_a_cluster_share_the_cores_of_their_machines() -> None:
+    here = Train(output=Path("x"), tiles="2x1", threads=3)
+    assert options_of_tiles(here) == ["--threads", "3"]
+    assert options_of_tiles(Train(output=Path("x"), tiles="2x1")) == []
+    away = Train(output=Path("x"), tiles="2x1", cluster="local", cpus=2.5, device="cpu")
+    assert options_of_tiles(away) == ["--threads", "2", "--device", "cpu"]
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,9 @@ SCHEMA = "compgs tiles plan 1"
 MOST_TILES = 1024  # of a grid; a million points each are a thousand million
 # A tile for each so many points or views: what a training keeps within a few gigabytes.
 POINTS_A_TILE, VIEWS_A_TILE = 250_000, 400
-MARGIN = 0.2  # of a core's sides, by which a tile's training sees more than its core
+# By how much a tile's training sees more than its core at each edge: this share of the core's side, but at most as far
+# as this share of the core's points lies beyond. Sides say little where a few points lie far away.
+MARGIN = 0.2
 EDGES = 0.02  # share of a core's points on each side that do not say how long the side is: outer cores have no end
 LEAST_SHARE = 0.1  # of a picture, from which on a view shows a tile
 FEWEST_VIEWS = 8  # of a tile, if so many show anything of it
@@ -154,7 +156,7 @@ def plan_tiles(scene: Scene, columns: int, rows: int) -> Plan:
                 f"tiles {columns}x{rows}: tile {name} would have {points.sum()} points, expected at least "
                 f"{MIN_POINTS}; use fewer tiles"
             )
-    padded = {name: _padded(core, _sides(places[inside[name]])) for name, core in cores.items()}
+    padded = {name: _padded(core, places, inside[name]) for name, core in cores.items()}
     views = _views_of(scene, cameras, sample, ground, cores, padded)
     tiles = tuple(
         Tile(name, core, padded[name], int(inside[name].sum()), views[name]) for name, core in cores.items()
@@ -200,9 +202,19 @@ def _sides(places: np.ndarray) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def _padded(core: Core, sides: tuple[float, float]) -> Core:
-    margins = MARGIN * np.array(sides)
-    low, high = (np.array(core.low) - margins).tolist(), (np.array(core.high) + margins).tolist()
+def _padded(core: Core, places: np.ndarray, inside: np.ndarray) -> Core:
+    """The core with its margins; places: [P, 2] of all points, inside: [P] bool."""
+    sides, few = _sides(places[inside]), math.ceil(MARGIN * inside.sum())
+    low, high = list(core.low), list(core.high)
+    for axis in (0, 1):
+        other = 1 - axis
+        beside = (places[:, other] >= core.low[other]) & (places[:, other] < core.high[other])
+        for edges, sign in ((low, -1), (high, 1)):
+            if math.isfinite(edges[axis]):
+                beyond = sign * (places[beside, axis] - edges[axis])
+                nearest = np.sort(beyond[beyond >= 0])[:few]
+                margin = MARGIN * sides[axis]
+                edges[axis] += sign * min(margin, float(nearest[-1]) if len(nearest) else margin)
     return Core((low[0], low[1]), (high[0], high[1]))
 
 
