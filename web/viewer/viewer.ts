@@ -246,9 +246,8 @@ export class Viewer {
   private frameCamera(): FrameCamera | null {
     const { info, fixed, canvas } = this;
     const target = this.controls.target;
-    if (!info || !canvas) return null;
+    if (!info || !target || !canvas) return null;
     if (fixed) return inFrame(fixed, info.worldOffset);
-    if (!target) return null;
     const { width, height } = canvas;
     const lens = info.viewpoints?.views[this.view];
     // The whole of the viewpoint's picture is seen, whatever the shape of the window.
