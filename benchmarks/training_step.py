@@ -72,6 +72,7 @@ def breakdown(options: argparse.Namespace) -> dict[str, Any]:
     from compgs.scene import load_scene
     from compgs.training.checkpoint import CHECKPOINT_NAME, load_checkpoint
     from compgs.training.profile import WARM_UP, StepProfile
+    from compgs.training.trainer import PARTS, stations
 
     scene = load_scene(options.scene[0], downscale=options.downscale[0])
     model, config = None, Config()
@@ -83,7 +84,8 @@ def breakdown(options: argparse.Namespace) -> dict[str, Any]:
         config = replace(config, model=model.config.model, entropy=model.config.entropy)
         model.mask[:] = True
     trainer = trainer_in_mid_run(scene, config, model)
-    trainer.profile = profile = StepProfile()
+    profile = StepProfile()
+    profile.watch(trainer, PARTS, stations)
     for _ in range(WARM_UP):
         trainer.train_step()
     before = time.process_time()

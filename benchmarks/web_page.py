@@ -1,10 +1,10 @@
 """The page with a scene: how close its picture is to the renderer's, and how soon it is there, in headless Chromium.
 
-    python benchmarks/web_page.py plush.cgs fox.cgs [--anchors 50000] [--times 3]
+    python benchmarks/web_page.py plush.cgs fox.cgs [--anchors 50000] [--times 3] [--webgpu]
 
 Pictures are taken at the cameras that the file keeps, and compared with `compgs.render`. Seconds are from the page's
-first byte until the whole scene is shown, the best of some visits; Chromium draws by software here. `--anchors` adds
-a made-up file of that many.
+first byte until the whole scene is shown, the best of some visits; Chromium draws by software here, with WebGL2 or,
+by `--webgpu`, with WebGPU. `--anchors` adds a made-up file of that many.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from compgs.viewer import html_page
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "tests" / "viewer"))
-from headless import timed_visit  # noqa: E402
+from headless import FLAGS, WEBGPU_FLAGS, visit  # noqa: E402
 from made_content import make_content, make_dimensions, paper_groups  # noqa: E402
 from made_heads import make_heads  # noqa: E402
 
@@ -35,7 +35,9 @@ def main() -> None:
     parser.add_argument("files", type=Path, nargs="*")
     parser.add_argument("--anchors", type=int, nargs="*", default=[])
     parser.add_argument("--times", type=int, default=3)
+    parser.add_argument("--webgpu", action="store_true")
     options = parser.parse_args()
+    flags, query = (WEBGPU_FLAGS, "?renderer=webgpu") if options.webgpu else (FLAGS, "")
     browser = shutil.which("chromium")
     if browser is None:
         raise SystemExit("no chromium on PATH")
@@ -48,13 +50,14 @@ def main() -> None:
             page = html_page(data, file.stem)
             model = compgs.decode(file)
             best, shown = np.inf, ""
-            for visit in range(options.times):
-                cameras = list(model.viewpoints) if visit == 0 else []
-                pictures, error, seconds = timed_visit(browser, Path(folder) / f"visit{visit}", page, cameras)
-                assert error == ": ", error
-                best = min(best, seconds)
-                if pictures:
-                    pairs = zip(pictures, cameras, strict=True)
+            for time in range(options.times):
+                cameras = list(model.viewpoints) if time == 0 else []
+                profile = Path(folder) / f"visit{time}"
+                seen = visit(browser, profile, page, cameras, flags=flags, query=query)
+                assert seen.error == ": ", seen.error
+                best = min(best, seen.seconds)
+                if cameras:
+                    pairs = zip(seen.pictures, cameras, strict=True)
                     values = [
                         psnr(picture, to_8bit(compgs.render(model, camera).image))
                         for picture, camera in pairs

@@ -120,7 +120,7 @@ HEAVY = {"torch", "scipy", "safetensors"}
 TRAINS = {
     "tensors", "entropy", "losses", "stored_weights", "trained_model", "training", "codec.encoder",
     *(f"methods.parts.{name}" for name in ("vector_quantization", "fake_quantization", "significance")),
-    "methods.compact_3dgs.tensors",
+    "methods.compact_3dgs.tensors", "methods.c3dgs.sensitivity", "methods.c3dgs.shapes",
     *(f"methods.anchors.{part}" for part in ("networks", "prediction", "model", "trainer")),
     *(f"methods.cosa.{part}" for part in ("entropy", "model", "trainer", "writer")),
 }  # fmt: skip

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from compgs import metrics
 from compgs.cameras import Camera
 from compgs.devices import chosen_device
-from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
+from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError, SplatFileError
 from compgs.evaluation.camera_path import between, surround
 from compgs.evaluation.importance import splat_importance
 from compgs.formats import WRITERS, SplatArrays, format_of, open_scene, scene_file, spz
@@ -112,6 +112,11 @@ def export(
         tile = scene_file(source).parent / model.manifest.tiles[0].file
         raise ConfigError(
             f"{source}: tiles are exported one by one, as {tile}: together they may not fit in memory"
+        )
+    if not isinstance(model, HybridModel | SplatModel):
+        raise SplatFileError(
+            f"{source}: its splats are made anew for each camera, by networks that no other format holds; it can be "
+            "rendered, compared and evaluated as it is"
         )
     cameras = own_cameras(model)
     fitted = [smaller(c) for c in (*cameras, *between(cameras, max(0, FITTED_CAMERAS - len(cameras))))]

@@ -157,6 +157,11 @@ class TrainedModel(nn.Module):
     def device(self) -> torch.device:
         return self.log_scales.device
 
+    def slots(self, rows: Tensor) -> Tensor:
+        """[V * K] int64: where the coupled primitives of the anchors in `rows` [V] stand among those of all."""
+        k = self.dimensions.coupled_primitives
+        return (rows[:, None] * k + torch.arange(k, device=rows.device)).view(-1)
+
     def positions(self, rows: Tensor | None = None) -> Tensor:
         """[N, 3] float32 world units in the local frame, of the given anchors or all."""
         coordinates = self.coordinates if rows is None else self.coordinates[rows]

@@ -7,15 +7,17 @@ import pytest
 import torch
 
 from compgs.config import Config, ModelConfig, TrainingConfig
+from compgs.errors import ConfigError
 from compgs.methods.anchors.model import AnchorModel, initial_anchors
 from compgs.methods.anchors.prediction import predict_anchors
 from compgs.methods.anchors.scene import network_shapes
 from compgs.methods.anchors.settings import AnchorSection
-from compgs.methods.anchors.trainer import AnchorTrainer
+from compgs.methods.anchors.trainer import PARTS, AnchorTrainer, train_anchors
 from compgs.model.constants import CUTOFF_SIGMAS
 from compgs.render import Renderable
 from compgs.scene.views import Scene
 from compgs.training.loop import Run
+from compgs.training.profile import StepProfile
 
 K = 3
 
@@ -121,3 +123,24 @@ def test_plain_anchors_learn_and_grow(blob_scene: Scene, config: Config) -> None
     assert trainer.model.anchors > before
     assert np.mean(losses[-3:]) < 0.5 * np.mean(losses[:2])
     assert trainer.estimated_bytes() == 4 * sum(p.numel() for p in trainer.model.parameters())
+
+
+def test_a_profile_names_the_parts_of_a_step(blob_scene: Scene, config: Config) -> None:
+    profile = StepProfile()
+    train_anchors(AnchorTrainer, blob_scene, config, Run("toy", device="cpu", profile=profile))
+    found = profile.milliseconds()
+    assert found.keys() >= {
+        *PARTS.values(),
+        "loss, backward",
+        "rasterization, backward",
+        "projection, backward",
+    }
+    assert all(milliseconds > 0 for milliseconds in found.values())
+
+
+def test_several_views_a_step_are_refused(blob_scene: Scene, config: Config) -> None:
+    several = replace(config, training=replace(config.training, views_per_step=2))
+    with pytest.raises(
+        ConfigError, match="method anchors trains in one process, with one view a step; found 1 and 2"
+    ):
+        AnchorTrainer(blob_scene, several, torch.device("cpu"), "anchors")

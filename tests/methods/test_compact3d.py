@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -154,6 +155,25 @@ def test_codebooks_of_a_small_scene_are_smaller(trainer: SplatTrainer) -> None:
     hooks = LearnedCodebooks(section, TrainingConfig())
     assert hooks.counts(20_000, 3) == {"dc": 512, "log_scales": 512, "quaternions": 512, "rest": 64}
     assert hooks.counts(3_000_000, 3)["dc"] == 4096
+
+
+def test_the_schedule_is_the_published_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: dict[str, list[int]] = {"assign": [], "prune": []}
+    for name, steps in done.items():
+        monkeypatch.setattr(LearnedCodebooks, name, lambda self, trainer, s=steps: s.append(trainer.step))
+    for steps, scale in ((30_000, 1), (3_000, 10), (600, 50)):
+        for each in done.values():
+            each.clear()
+        hooks = LearnedCodebooks(Compact3DSection(), TrainingConfig(steps=steps))
+        hooks.penalized = torch.zeros((), dtype=torch.int64)
+        trainer = SimpleNamespace(step=0, parameters=range(7))
+        while trainer.step < steps:
+            trainer.step += 1
+            hooks.after_step(trainer)  # type: ignore[arg-type]
+        every = max(100 // scale, 20)
+        assert done["assign"] == list(range(15_000 // scale, 25_000 // scale, every))
+        assert done["prune"] == list(range(16_000 // scale, 20_000 // scale + 1, 1_000 // scale))
+        assert int(hooks.penalized) == 7
 
 
 def test_very_short_runs_end_with_codes(blob_scene: Scene, tmp_path: Path) -> None:

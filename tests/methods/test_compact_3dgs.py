@@ -7,22 +7,24 @@ import numpy as np
 import pytest
 import torch
 
+import compgs
 from compgs.errors import SplatFileError
 from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import Packed, read, write_packed
-from compgs.methods import train, write
+from compgs.methods import settings_of, train, write
 from compgs.methods.compact_3dgs.color_network import ColorNetwork, contracted, network_shapes
 from compgs.methods.compact_3dgs.hash_grid import GridLayout, grid_features
 from compgs.methods.compact_3dgs.hooks import Compact
 from compgs.methods.compact_3dgs.tensors import color_coefficients, features, features_reference
 from compgs.methods.compact_3dgs.tensors import contracted as contracted_tensors
+from compgs.methods.parts.vector_quantization import residual_labels
 from compgs.model.spherical_harmonics import COLOR_OFFSET
 from compgs.model.spherical_harmonics_kernels import Y0
 from compgs.render import Renderable, render
 from compgs.scene.views import Scene
 from compgs.training import SplatTrainer
 
-from .quick import check_continues_exactly, quick
+from .quick import quick
 
 SMALL = {"grid_levels": 4, "grid_bits": 6, "grid_growth": 2.0, "grid_base": 2, "mask_lr": 0.1}
 LAYOUT = GridLayout(levels=4, features=2, base=2, growth=2.0, table_bits=6)
@@ -104,9 +106,23 @@ def test_the_file_shows_what_the_training_drew(blob_scene: Scene) -> None:
     )
 
 
-@pytest.mark.parametrize("stop", [20, 40])
-def test_a_run_that_was_stopped_continues_exactly(stop: int, blob_scene: Scene, tmp_path: Path) -> None:
-    check_continues_exactly("compact-3dgs", small(codes=8, codes_start=0.4), blob_scene, stop, tmp_path)
+def test_a_run_that_was_stopped_continues_exactly(check_continues: Any) -> None:
+    check_continues("compact-3dgs", small(codes=8, codes_start=0.4), (10, 30))
+
+
+def test_sums_of_codes_below_zero_are_the_smallest_scale(file: Path, tmp_path: Path) -> None:
+    codes = np.full((6, 16, 3), -1.0, np.float32)
+    scales = open_scene(
+        changed(file, tmp_path / "b.packed", {}, {"scale_codes": codes})
+    ).shapes.splats.log_scales
+    np.testing.assert_allclose(np.exp(scales), 1e-6 * 4.4, rtol=1e-4)
+
+
+def test_what_holds_no_lasting_splats_is_neither_exported_nor_compressed(file: Path, tmp_path: Path) -> None:
+    for convert in (compgs.export, compgs.compress):
+        with pytest.raises(SplatFileError, match=r"a\.packed: its splats are made anew for each camera"):
+            convert(file, tmp_path / ("b.ply" if convert is compgs.export else "b.cgs"))
+    assert not list(tmp_path.iterdir())
 
 
 def changed(file: Path, path: Path, facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> Path:
@@ -244,6 +260,59 @@ def test_hidden_splats_are_removed_with_all_that_is_theirs(blob_scene: Scene) ->
     assert len(made.parameters) == 100, "a scene of nothing is nobody's wish"
 
 
+def test_hidden_splats_go_when_density_is_controlled_and_now_and_then_after_it(blob_scene: Scene) -> None:
+    made, hooks = trainer(blob_scene, mask_every=0.1, splats={"densify_stop": 0.5})
+
+    def hide() -> int:
+        with torch.no_grad():
+            hooks.masks[:5] = -6.0
+        return int((hooks.masks > -4.5).sum())
+
+    shown = hide()
+    hooks.densified(made)
+    assert len(made.parameters) == shown
+    left = []
+    for step in (16, 17, 20, 21, 24):  # growth ends with step 20; then each fourth
+        made.step, shown = step, hide()
+        hooks.after_step(made)
+        left.append(len(made.parameters) == shown)
+    assert left == [False, False, True, False, True]
+
+
+def test_codes_learn_from_what_they_miss(blob_scene: Scene) -> None:
+    made, hooks = trainer(blob_scene, codes=4, code_stages=1)
+    hooks.begin_codes(made)
+    drawn = made.draw(0)
+    assert hooks.error is not None
+    added = hooks.loss(drawn, made)
+    assert added.item() == pytest.approx(5e-4 * hooks.masks.sigmoid().mean().item() + hooks.error.item())
+    added.backward()
+    vectors = made.parameters.log_scales.detach().exp()
+    labels = residual_labels(vectors, hooks.scale_codes.detach())[:, 0]
+    by_hand = torch.zeros(4, 3).index_add_(0, labels, hooks.scale_codes.detach()[0][labels] - vectors)
+    torch.testing.assert_close(hooks.scale_codes.grad[0], 2 * by_hand / vectors.numel())
+    assert made.parameters.log_scales.grad is None, "what they stand for does not come to meet them"
+
+
+def test_settings_are_those_of_the_release() -> None:
+    config = settings_of("compact-3dgs")
+    c = config.compact
+    assert (c.mask_weight, c.mask_lr, c.mask_threshold, round(30_000 * c.mask_every)) == (
+        5e-4,
+        0.01,
+        0.01,
+        1_000,
+    )
+    assert [round(30_000 * at) for at in (*c.color_lr_falls, c.codes_start)] == [
+        5_000,
+        15_000,
+        25_000,
+        29_000,
+    ]
+    assert (c.grid_bits, c.code_stages, c.codes, config.splats.harmonics) == (19, 6, 64, 0)
+    assert settings_of("compact-3dgs", "scaled").compact.grid_bits == 11
+
+
 def test_colors_learn_by_thirds(blob_scene: Scene) -> None:
     made, hooks = trainer(blob_scene)
     seen = []
@@ -254,6 +323,10 @@ def test_colors_learn_by_thirds(blob_scene: Scene) -> None:
         assert rates["hooks/grid"] == rates["hooks/weights_0"]
         seen.append(rates["hooks/grid"])
     assert seen == pytest.approx([0.01, 0.0033, 0.001089, 0.00035937])
+    four, hooks = trainer(blob_scene, training={"views_per_step": 4})
+    hooks.view(blob_scene.train_views[0].camera, four.views.photograph(0), four)
+    rates = {group["name"]: group["rates"][0] for group in four.optimizer.param_groups}
+    assert rates["hooks/grid"] == pytest.approx(0.02), "as those of all other parameters"
 
 
 def test_codebooks_begin_late_and_what_they_miss_shrinks(blob_scene: Scene) -> None:

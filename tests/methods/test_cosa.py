@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from compgs.codec.integer_network import FRACTION_BITS
+from compgs.config import Config
 from compgs.errors import CompGSError, NotEncodable, SplatFileError
+from compgs.exporting import export
 from compgs.formats import component_bytes, open_scene, packed
 from compgs.methods import METHODS, settings_of, train, write
 from compgs.methods.cosa import reader
@@ -48,6 +50,15 @@ def file(trained: CosaModel, tmp_path: Path) -> Path:
     path = tmp_path / "a.packed"
     write(trained, path, method="cosa-gs")
     return path
+
+
+def test_presets_differ_in_what_they_are_for() -> None:
+    default, paper, quick = (settings_of("cosa-gs", name) for name in ("default", "paper", "quick"))
+    assert default.training.lmbda == paper.training.lmbda == quick.training.lmbda
+    assert default.control == paper.control == quick.control != Config().control
+    assert (default.model.coupled_primitives, paper.model.coupled_primitives) == (5, 10)
+    assert isinstance(paper, CosaConfig) and (paper.cosa.head_bits, paper.cosa.symbols_start) == (16, 1.0)
+    assert quick.training.steps == Config().training.steps * 4000 // 30_000
 
 
 def test_the_suffix_is_the_containers() -> None:
@@ -152,6 +163,24 @@ def test_rendering_sees_noise_of_half_a_step_in_the_second_phase(blob_scene: Sce
     assert 0.4 < away.max() <= 0.5 + 1e-3
 
 
+def test_noise_in_the_bits_alone_leaves_rendering_what_the_file_will_have(trained: CosaModel) -> None:
+    def noise(like: torch.Tensor) -> torch.Tensor:
+        return torch.full_like(like, 0.4)
+
+    arguments = trained.places(), trained.natural()
+    with torch.no_grad():
+        noisy, apart, hard = (
+            trained.chain(*arguments, noise=given, network_bits=8, everywhere=everywhere)
+            for given, everywhere in ((noise, True), (noise, False), (None, False))
+        )
+    for group in GROUPS:
+        assert torch.equal(apart.values[group], hard.values[group])
+        assert not torch.equal(apart.values[group], noisy.values[group])
+        assert not torch.equal(apart.bits[group], hard.bits[group])
+    y = trained.natural()["feature"].detach() / trained.chain.step("feature").detach()
+    torch.testing.assert_close(noisy.values["feature"], y + 0.4)
+
+
 def test_an_anchors_own_bits_go_with_its_last_primitive(blob_scene: Scene) -> None:
     trainer = CosaTrainer(blob_scene, settings(position_bits=0.0), CPU, "cosa-gs")
     model = trainer.model
@@ -184,7 +213,7 @@ def test_lambda_weighs_megabytes_of_the_whole_scene(blob_scene: Scene) -> None:
     assert chained is not None and masks is not None
     bits = trainer.model.total_bits(chained.bits, masks).item()
     added = trainer.added()
-    assert added is not None and float(added) == pytest.approx(3.0 * bits / BITS_PER_MEGABYTE)
+    assert added is not None and added.item() == pytest.approx(3.0 * bits / BITS_PER_MEGABYTE)
     added.backward()
     for name, parameter in trainer.model.named_parameters():
         costs = name.split(".")[0] in ("features", "offsets", "log_scales", "latents", "mask_logits", "chain")
@@ -226,6 +255,10 @@ def test_what_has_diverged_is_not_written(blob_scene: Scene, tmp_path: Path) -> 
     with torch.no_grad():
         trainer.model.features[3, 2] = torch.nan
     with pytest.raises(NotEncodable, match="features"):
+        write(trainer.model, tmp_path / "a", method="cosa-gs")
+    with torch.no_grad():
+        trainer.model.features[3, 2] = 1e6
+    with pytest.raises(NotEncodable, match=r"a feature is .* steps from"):
         write(trainer.model, tmp_path / "a", method="cosa-gs")
     with torch.no_grad():
         trainer.model.features.zero_()
@@ -295,6 +328,11 @@ def test_facts_that_no_encoder_writes_are_refused(name: str, value: Any, content
     facts = {**content.facts, name: value}
     with pytest.raises(SplatFileError, match=f"{name}|step or unit|context|networks"):
         reader.content_of(replace(content, facts={k: v for k, v in facts.items() if v is not None}))
+
+
+def test_its_networks_are_not_exported(file: Path, tmp_path: Path) -> None:
+    with pytest.raises(SplatFileError, match=r"a\.packed: its splats are made anew for each camera"):
+        export(file, tmp_path / "a.ply")
 
 
 def test_a_damaged_file_is_refused_by_its_checksum(file: Path) -> None:

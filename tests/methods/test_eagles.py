@@ -12,7 +12,7 @@ from compgs.errors import SplatFileError
 from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import Packed, read, write_packed
 from compgs.losses import Target
-from compgs.methods import train, write
+from compgs.methods import settings_of, train, write
 from compgs.methods.eagles.file import cosines, decoded
 from compgs.methods.eagles.hooks import Latents, image_scale, smaller
 from compgs.methods.parts.histogram import packed_symbols, unpacked_symbols
@@ -21,7 +21,7 @@ from compgs.render import render
 from compgs.scene.views import Scene
 from compgs.training import SplatTrainer
 
-from .quick import check_continues_exactly, quick
+from .quick import quick
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +85,8 @@ def test_the_file_holds_what_was_drawn(blob_scene: Scene) -> None:
     assert drawn.rest.abs().max() > 1e-3
 
 
-@pytest.mark.parametrize("stop", [10, 20])
-def test_a_run_that_was_stopped_continues_exactly(stop: int, blob_scene: Scene, tmp_path: Path) -> None:
-    check_continues_exactly("eagles", quick("eagles"), blob_scene, stop, tmp_path)
+def test_a_run_that_was_stopped_continues_exactly(check_continues: Any) -> None:
+    check_continues("eagles", quick("eagles"), (10, 20))
 
 
 def test_splats_without_harmonics_have_no_latents_of_them(blob_scene: Scene, tmp_path: Path) -> None:
@@ -141,6 +140,11 @@ def test_latents_learn_slower_the_larger_their_decoder_but_for_opacities(blob_sc
     assert later["hooks/opacity_latents"] == pytest.approx(0.1 * 0.05)
     size = float(torch.linalg.norm(hooks.rotation_decoder.detach()))
     assert later["hooks/rotation_latents"] == pytest.approx(0.1 * 1e-3 / size)
+    # Steps of four views are twice as long, as those of all other parameters.
+    four, hooks = trainer(blob_scene, training={"views_per_step": 4})
+    hooks.view(blob_scene.train_views[0].camera, four.views.photograph(0), four)
+    rates = {group["name"]: group["rates"][0] for group in four.optimizer.param_groups}
+    assert rates["hooks/opacity_latents"] == pytest.approx(2 * 0.1 * 0.05)
 
 
 def test_images_grow_from_coarse_to_fine(blob_scene: Scene) -> None:
@@ -185,11 +189,42 @@ def test_what_the_views_see_least_of_is_pruned(blob_scene: Scene) -> None:
     assert len(made.parameters) == len(hooks.rotation_latents) == 90
 
 
-def test_opacities_that_are_reset_are_those_of_the_latents(blob_scene: Scene) -> None:
+def test_opacities_that_are_reset_are_those_of_the_latents(
+    blob_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made, hooks = trainer(blob_scene)
+    made.train_step()
+    moment = "exp_avg"
+    assert made.optimizer.state[hooks.opacity_latents][moment].any()
     made.parameters.opacity_logits.data.fill_(-4.6)
-    hooks.take_opacities(made)
-    assert made.as_drawn().opacity_logits.sub(-4.6).abs().max() <= 0.25 + 1e-6
+    hooks.after_step(made)
+    assert (made.as_drawn().opacity_logits > -4).all(), "only what the schedule resets is taken over"
+    made.parameters.opacity_logits.data.fill_(-4.6)
+    monkeypatch.setattr(type(made.schedule), "reset_due", lambda schedule, step: step == made.step)
+    hooks.after_step(made)
+    assert made.as_drawn().opacity_logits.sub(-4.6).abs().max() <= 0.5 * hooks.opacity_decoder.abs().item()
+    assert not made.optimizer.state[hooks.opacity_latents][moment].any(), "and they begin anew"
+
+
+def test_latents_of_zero_are_no_rotation(blob_scene: Scene) -> None:
+    made, hooks = trainer(blob_scene)
+    with torch.no_grad():
+        hooks.rotation_latents[3:5] = 0.4
+    drawn = made.as_drawn()
+    assert drawn.quaternions[3].tolist() == [1.0, 0.0, 0.0, 0.0]
+    raw = (t.numpy() for t in (drawn.means, drawn.log_scales, drawn.dc))
+    arrays = decoded(*raw, codes=hooks.codes(), world_offset=(0.0, 0.0, 0.0))
+    assert arrays.quaternions[4].tolist() == [1.0, 0.0, 0.0, 0.0]
+
+
+def test_settings_are_those_of_the_release() -> None:
+    config = settings_of("eagles")
+    s, e = config.splats, config.eagles
+    steps = [round(30_000 * x) for x in (s.densify_every, s.densify_stop, s.reset_every)]
+    assert steps == [125, 18_000, 2_500]
+    published = quick("eagles", steps=30_000)
+    assert Latents(published).prune_at == {5_100, 10_200, 15_300, 20_400, 25_500}
+    assert (e.harmonics_latents, e.rotation_latents, e.prune_share, e.latent_lr) == (16, 8, 0.15, 0.1)
 
 
 def test_more_pruning_leaves_fewer_splats_and_a_smaller_file(

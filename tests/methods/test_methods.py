@@ -16,11 +16,12 @@ from compgs.cli.main import main
 from compgs.config import Config, SplatConfig, TrainingConfig
 from compgs.errors import CheckpointError, ConfigError, SplatFileError
 from compgs.formats import component_bytes, open_scene, write_ply
+from compgs.formats.packed import SUFFIX
 from compgs.methods import METHODS, settings_of, train, write
 from compgs.model.splats import SplatModel
 from compgs.render import render
 from compgs.scene.generated import generate_scene
-from compgs.scene.views import Scene
+from compgs.scene.views import Points, Scene
 from compgs.training.checkpoint import read_checkpoint_file
 
 STEPS = 40
@@ -46,6 +47,7 @@ def test_the_registry_says_what_a_reader_needs_to_know() -> None:
     assert list(METHODS)[:4] == ["compgs", "3dgs", "spz", "sog"]
     for name, method in METHODS.items():
         assert name == method.name and method.suffix.startswith(".")
+        assert method.open is None or method.suffix == SUFFIX
         assert method.description and method.reference
         assert isinstance(settings_of(name), method.settings)
 
@@ -153,6 +155,29 @@ def test_what_a_method_cannot_begin_with_is_refused(
     )
     with pytest.raises(ConfigError, match=r"a \.spz file cannot say where"):
         train(far, method="spz")
+
+
+@pytest.mark.parametrize("method", ["compact3d", "c3dgs", "lightgaussian"])
+def test_files_of_methods_say_where_their_positions_count_from(
+    method: str, blob_scene: Scene, tmp_path: Path
+) -> None:
+    def moved(views: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(replace(v, camera=v.camera.moved((-1e6, 0.0, 0.0))) for v in views)
+
+    points = Points(blob_scene.points.positions + np.array([1e6, 0.0, 0.0]), blob_scene.points.colors)
+    far = replace(
+        blob_scene,
+        train_views=moved(blob_scene.train_views),
+        test_views=moved(blob_scene.test_views),
+        points=points,
+    )
+    path = tmp_path / "a.packed"
+    shown = []
+    for scene in (blob_scene, far):
+        write(train(scene, quick(method), method=method, device="cpu"), path, method=method)
+        shown.append(render(open_scene(path), scene.test_views[0].camera).image)
+    assert open_scene(path).world_offset[0] > 9e5
+    assert np.abs(shown[0] - shown[1]).mean() < 0.03 < shown[0].mean()
 
 
 def test_a_checkpoint_of_another_method_is_not_continued(blob_scene: Scene, tmp_path: Path) -> None:

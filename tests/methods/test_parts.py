@@ -104,7 +104,7 @@ def test_moving_averages_find_what_k_means_finds(
 
 def test_moving_averages_go_to_what_weighs_more() -> None:
     vectors, weights = torch.tensor([[0.0], [1.0]]), torch.tensor([1.0, 9.0])
-    found = averaged_codes(vectors, torch.tensor([[0.5]]), 80, chance(), weights=weights)
+    found = averaged_codes(vectors, torch.tensor([[0.5]]), 30, chance(), weights=weights)
     assert found.item() == pytest.approx(0.9, abs=1e-5)
     one = averaged_codes(vectors, torch.tensor([[0.5]]), 1, chance(), weights=weights)
     assert one.item() == pytest.approx(0.9, abs=1e-5), "a code has no memory before its first batch"

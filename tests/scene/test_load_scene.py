@@ -256,3 +256,21 @@ def test_a_hundred_points_are_enough(write_capture: Write) -> None:
 def test_settings_out_of_range_are_refused(write_capture: Write, settings: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(settings))):
         load_scene(write_capture(), **settings)
+
+
+def test_photographs_are_read_at_once_or_when_somebody_looks(
+    write_capture: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from compgs.scene import images
+
+    folder, read, asked = write_capture(), images.read_photograph, []
+    monkeypatch.setattr(
+        images, "read_photograph", lambda posed, behind: asked.append(posed.name) or read(posed, behind)
+    )
+    scene = load_scene(folder, at_once=False)
+    assert asked == []
+    first = scene.train_views[0]
+    assert first.image.shape == (first.camera.height, first.camera.width, 3)
+    assert asked == [first.name]
+    load_scene(folder)
+    assert len(asked) == 1 + len(scene.train_views) + len(scene.test_views)

@@ -35,7 +35,9 @@ CONFIG = Config(
     control=ControlConfig(
         start=0.2, stop=0.7, every=0.2, minimum_views=2, gradient_threshold=1e-5, opacity_threshold=0.01
     ),
-    training=TrainingConfig(steps=STEPS, seed=3, views_per_step=2, exposure=True, left_out=0.1),
+    training=TrainingConfig(
+        steps=STEPS, seed=3, views_per_step=2, exposure=True, left_out=0.1, rate_start=0.0
+    ),
 )
 TRAINERS: dict[str, Callable[..., Any]] = {"compgs": Trainer, "3dgs": SplatTrainer}
 

@@ -1,12 +1,15 @@
 import signal
+import time
 from dataclasses import replace
+from threading import Event
 
 import pytest
 import torch
 
-from compgs.errors import CheckpointError
+from compgs.errors import CheckpointError, OutputError
 from compgs.interrupt import Terminated, ended_on_request, held_back
-from compgs.training.checkpoint import load_checkpoint, read_checkpoint_file, write_checkpoint_file
+from compgs.training import checkpoint as checkpoint_module
+from compgs.training.checkpoint import Writer, load_checkpoint, read_checkpoint_file, write_checkpoint_file
 from compgs.training.loop import Pace
 from compgs.training.trainer import Trainer
 
@@ -128,9 +131,9 @@ def test_a_second_ctrl_c_waits_for_the_checkpoint(blob_scene, tiny_config, tmp_p
     trainer = Trainer(blob_scene, tiny_config, CPU)
     save = trainer.save
 
-    def impatient(where):
+    def impatient(where, writer):
         signal.raise_signal(signal.SIGINT)
-        save(where)
+        save(where, writer)
 
     monkeypatch.setattr(trainer, "save", impatient)
 
@@ -159,20 +162,32 @@ def test_a_run_that_is_stopped_at_once_leaves_the_checkpoint_of_an_earlier_run(
     assert path.read_bytes() == b"of an earlier run"
 
 
-def test_after_its_first_checkpoint_a_run_keeps_its_own(blob_scene, tiny_config, tmp_path):
+def test_after_its_first_checkpoint_a_run_keeps_its_own(blob_scene, tiny_config, tmp_path, monkeypatch):
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(b"of an earlier run")
     config = replace(tiny_config, training=replace(tiny_config.training, checkpoint_minutes=1e-9))
-    found = []
+    found = {}
 
     def look(status):
-        found.append(load_checkpoint(path).state["step"] == status.step)
-        stopped_at_10(status)
+        if path.read_bytes() != b"of an earlier run":
+            found.setdefault(load_checkpoint(path).state["step"], status.step)
+        if status.step >= 20:
+            raise KeyboardInterrupt
 
+    trainer = Trainer(blob_scene, config, CPU)
+    step = trainer.train_step
+
+    def slow_step():
+        time.sleep(0.02)  # in which a checkpoint is written
+        return step()
+
+    monkeypatch.setattr(trainer, "train_step", slow_step)
     with pytest.raises(KeyboardInterrupt):
-        Trainer(blob_scene, config, CPU).run(path, look)
-    assert found == [True] * 10  # a report follows each checkpoint at once
-    assert load_checkpoint(path).state["step"] == 10
+        trainer.run(path, look)
+    assert len(found) >= 3
+    late = [told - written for written, told in found.items()]
+    assert sorted(late)[len(late) // 2] <= 3, "a report follows each checkpoint at once"
+    assert load_checkpoint(path).state["step"] == 20
 
 
 def test_a_continued_run_keeps_what_it_did_when_it_is_stopped_again(blob_scene, tiny_config, tmp_path):
@@ -217,3 +232,45 @@ def test_what_was_read_does_not_hold_the_file(tmp_path):
     with path.open("r+b") as file:
         file.write(b"\0" * path.stat().st_size)
     assert torch.equal(tensors["model/a"], torch.arange(4096.0))
+
+
+def test_a_checkpoint_beside_the_steps_is_of_the_step_at_which_it_was_begun(
+    blob_scene, tiny_config, tmp_path, monkeypatch
+):
+    """The disk is slow: two steps are done before the file is begun."""
+    trainer = Trainer(blob_scene, tiny_config, CPU)
+    for _ in range(3):
+        trainer.train_step()
+    trainer.save(tmp_path / "at_once.safetensors")
+    free = Event()
+    save_file = checkpoint_module.safetensors.torch.save_file
+    monkeypatch.setattr(
+        checkpoint_module.safetensors.torch, "save_file", lambda *a, **k: free.wait(60) and save_file(*a, **k)
+    )
+    writer = Writer()
+    trainer.save(tmp_path / "beside.safetensors", writer)
+    for _ in range(2):
+        trainer.train_step()
+    assert writer.busy and not (tmp_path / "beside.safetensors").exists()
+    free.set()
+    writer.finish()
+    (expected, told), (found, told_beside) = (
+        read_checkpoint_file(tmp_path / name, "compgs")
+        for name in ("at_once.safetensors", "beside.safetensors")
+    )
+    assert told == told_beside and expected.keys() == found.keys()
+    assert all(torch.equal(value, found[name]) for name, value in expected.items())
+
+
+def test_what_hinders_a_checkpoint_beside_the_steps_is_raised_by_the_run(
+    blob_scene, tiny_config, tmp_path, monkeypatch
+):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint_module.safetensors.torch, "save_file", full)
+    config = replace(tiny_config, training=replace(tiny_config.training, checkpoint_minutes=1e-9))
+    trainer = Trainer(blob_scene, config, CPU)
+    with pytest.raises(OutputError, match="No space left"):
+        trainer.run(tmp_path / "run.safetensors", None)
+    assert 0 < trainer.step < config.training.steps

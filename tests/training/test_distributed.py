@@ -1,5 +1,6 @@
 """Two ranks with one view each, against one with two views a step: the same sums in another order."""
 
+import contextlib
 import os
 import socket
 import subprocess
@@ -10,7 +11,10 @@ from typing import Any
 import pytest
 import torch
 
+from compgs.cli.console import say
+from compgs.cli.ranks import among_ranks
 from compgs.config import Config
+from compgs.errors import ConfigError, TrainingError
 from compgs.scene.views import Scene
 from compgs.training import distributed
 from compgs.training.trainer import Trainer
@@ -189,3 +193,49 @@ def test_torchrun_trains_one_file_and_says_everything_once(tmp_path: Path, found
     assert (tmp_path / "run" / "run.cgs").is_file() and (tmp_path / "run" / "results.json").is_file()
     assert "trained in" in out and "PSNR" in out
     assert other_out == ""
+
+
+def test_each_process_of_a_machine_has_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    cuda, cpu = torch.device("cuda"), torch.device("cpu")
+    assert distributed.local_device(cuda) == cuda
+    for name, value in {"WORLD_SIZE": "4", "RANK": "3", "LOCAL_RANK": "1"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert distributed.local_device(cuda) == torch.device("cuda", 1)
+    assert distributed.local_device(torch.device("cuda", 0)) == torch.device("cuda", 0), "asked for"
+    assert distributed.local_device(cpu) == cpu
+
+
+def test_processes_that_do_not_meet_are_told_where_they_looked(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {
+        "WORLD_SIZE": "2",
+        "RANK": "1",
+        "MASTER_ADDR": "10.0.0.1",
+        "MASTER_PORT": "29500",
+    }.items():
+        monkeypatch.setenv(name, value)
+
+    def nobody(backend: str) -> None:
+        assert backend == "gloo"
+        raise RuntimeError("timed out\nand more")
+
+    monkeypatch.setattr(torch.distributed, "init_process_group", nobody)
+    with (
+        pytest.raises(ConfigError, match=r"^rank 1 of 2: .* at 10\.0\.0\.1:29500 \(timed out\)$"),
+        distributed.joined(torch.device("cpu")),
+    ):
+        pass
+
+
+def test_other_ranks_than_the_first_say_nothing_but_what_goes_wrong_with_them(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(distributed, "joined", lambda device: contextlib.nullcontext())
+    for rank, said, prefix in (("0", "heard\n", ""), ("1", "", "rank 1: ")):
+        monkeypatch.setenv("RANK", rank)
+        monkeypatch.setenv("WORLD_SIZE", "2")
+        with pytest.raises(TrainingError, match=f"^{prefix}it broke$"), among_ranks("cpu") as leads:
+            assert leads == (rank == "0")
+            say("heard")
+            raise TrainingError("it broke")
+        assert capsys.readouterr().out == said

@@ -4,6 +4,7 @@ import http.server
 import json
 import subprocess
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,53 +16,129 @@ FLAGS = (
     "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync",
 )  # fmt: skip
+# With WebGPU by software, which a machine without graphics card must be asked for: its adapter, and a canvas for it.
+WEBGPU_FLAGS = (
+    *(flag for flag in FLAGS if flag != "--disable-gpu"),
+    *("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"),
+    *("--enable-features=Vulkan", "--use-vulkan=swiftshader"),
+)
 MAX_SECONDS = 240
-# Shows each camera and posts its pixels, bottom row first; then the text of the error box.
+POST = """const post = (name, body) => fetch("/" + name, { method: "POST", body });"""
+# Before anything else of the page: remembers what is written to the console.
+PRELUDE = """<script>
+  window.written = [];
+  for (const kind of ["info", "warn", "error"]) console[kind] = (line) => written.push(kind + ": " + line);
+  %s
+</script>"""
+# Shows each camera and posts its pixels and what drew them; then the text of the error box.
 DRIVER = """<script>(async () => {
-  const post = (name, body) => fetch("/" + name, { method: "POST", body });
+  %s
   const pause = () => new Promise((resolve) => setTimeout(resolve, 20));
   const text = (id) => document.getElementById(id).textContent;
+  const drawnWith = (canvas) => ["webgpu", "webgl2"].find((name) => canvas.getContext(name));
   addEventListener("unhandledrejection", (event) => post("failed", String(event.reason)));
   try {
     const viewer = window.compgsViewer;
     while (!text("error-text") && !text("status").includes(" in ")) await pause();
     await post("seconds", String(performance.now() / 1000));
     const cameras = text("error-text") ? [] : %s;
+    const drawn = [];
     for (const [i, camera] of cameras.entries()) {
+      await window.beforeCamera?.(i);
       await viewer.show(camera);
-      const gl = viewer.canvas.getContext("webgl2");
-      const pixels = new Uint8Array(4 * camera.width * camera.height);
-      gl.readPixels(0, 0, camera.width, camera.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-      await post("picture" + i, pixels);
+      const copy = new OffscreenCanvas(camera.width, camera.height).getContext("2d");
+      copy.drawImage(viewer.canvas, 0, 0);
+      drawn.push(drawnWith(viewer.canvas));
+      await post("picture" + i, copy.getImageData(0, 0, camera.width, camera.height).data);
     }
+    await post("drawn", JSON.stringify(drawn));
+    await post("console", JSON.stringify(window.written));
     await post("done", text("error-title") + ": " + text("error-text"));
   } catch (error) {
-    await post("failed", String(error.stack ?? error));
+    await post("failed", [error.stack ?? error, ...window.written].join("\\n"));
   }
 })();</script></body>"""
+# Says whether WebGPU can make a canvas red.
+RED = """<!doctype html><script>(async () => {
+  %s
+  try {
+    const device = await (await navigator.gpu.requestAdapter()).requestDevice();
+    const context = new OffscreenCanvas(8, 8).getContext("webgpu");
+    context.configure({ device, format: "rgba8unorm" });
+    const view = context.getCurrentTexture().createView();
+    const encoder = device.createCommandEncoder();
+    const color = { view, clearValue: [1, 0, 0, 1], loadOp: "clear", storeOp: "store" };
+    encoder.beginRenderPass({ colorAttachments: [color] }).end();
+    device.queue.submit([encoder.finish()]);
+    const copy = new OffscreenCanvas(8, 8).getContext("2d");
+    copy.drawImage(context.canvas, 0, 0);
+    await post("done", String(copy.getImageData(4, 4, 1, 1).data));
+  } catch (error) {
+    await post("done", String(error));
+  }
+})();</script>"""
 
 
-def visit(browser: str, folder: Path, page: bytes, cameras: list[Camera]) -> tuple[list[np.ndarray], str]:
-    """Pictures [H, W, 3] uint8 of the cameras, and what the page's error box says. `folder`: for the browser."""
-    pictures, error, _ = timed_visit(browser, folder, page, cameras)
-    return pictures, error
+@dataclass(frozen=True)
+class Visit:
+    """`pictures`: of the cameras, [H, W, 3] uint8; `drawn`: what drew them, "webgpu" or "webgl2"; `error`: of the
+    page's error box, ": " if there is none; `seconds`: until the page showed the whole scene or an error; `console`:
+    lines, each with its kind."""
+
+    pictures: list[np.ndarray]
+    drawn: list[str]
+    error: str
+    seconds: float
+    console: list[str]
 
 
-def timed_visit(
-    browser: str, folder: Path, page: bytes, cameras: list[Camera]
-) -> tuple[list[np.ndarray], str, float]:
-    """The same, and the seconds from the page's first byte until it shows the whole scene (or an error)."""
-    driver = DRIVER % json.dumps([_described(camera) for camera in cameras])
+def visit(
+    browser: str,
+    folder: Path,
+    page: bytes,
+    cameras: list[Camera],
+    flags: tuple[str, ...] = FLAGS,
+    query: str = "",
+    script: str = "",
+) -> Visit:
+    """Opens the page and shows the cameras, one after the other.
+
+    `folder`: for the browser. `flags`: of the browser. `query`: of the page's address, "?name=value".
+    `script`: runs before those of the page; a function `beforeCamera(index)` of it is called, and waited for, before
+    each camera.
+    """
+    driver = DRIVER % (POST, json.dumps([_described(camera) for camera in cameras]))
+    page = page.replace(b"<head>", b"<head>" + (PRELUDE % script).encode(), 1)
     page = page.replace(b"</body>", driver.encode())
+    got = _posted(browser, folder, page, flags, query)
+    return Visit(
+        pictures=[_picture(got[f"picture{i}"], c) for i, c in enumerate(cameras) if f"picture{i}" in got],
+        drawn=json.loads(got["drawn"]),
+        error=got["done"].decode(),
+        seconds=float(got["seconds"]),
+        console=json.loads(got["console"]),
+    )
+
+
+def offers_webgpu(browser: str, folder: Path) -> bool:
+    """Whether a page can draw with WebGPU, with WEBGPU_FLAGS."""
+    return _posted(browser, folder, (RED % POST).encode(), WEBGPU_FLAGS)["done"] == b"255,0,0,255"
+
+
+def _posted(
+    browser: str, folder: Path, page: bytes, flags: tuple[str, ...], query: str = ""
+) -> dict[str, bytes]:
+    """What a page posts, by name, until it posts "done". Fails where it posts "failed", or nothing for long."""
     got: dict[str, bytes] = {}
     finished = threading.Event()
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            self.send_response(200 if self.path == "/" else 404)
+            found = self.path == "/" + query
+            self.send_response(200 if found else 404)
             self.send_header("Content-Type", "text/html")
             self.end_headers()
-            self.wfile.write(page if self.path == "/" else b"")
+            self.wfile.write(page if found else b"")
 
         def do_POST(self) -> None:
             got[self.path[1:]] = self.rfile.read(int(self.headers["Content-Length"]))
@@ -75,9 +152,9 @@ def timed_visit(
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{server.server_port}/"
+        address = f"http://127.0.0.1:{server.server_port}/{query}"
         process = subprocess.Popen(
-            [browser, *FLAGS, f"--user-data-dir={folder}", address],
+            [browser, *flags, f"--user-data-dir={folder}", address],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -89,8 +166,7 @@ def timed_visit(
             server.shutdown()
     assert ended, f"the page did not finish within {MAX_SECONDS} s; it sent {sorted(got)}"
     assert "failed" not in got, got["failed"].decode()
-    pictures = [_picture(got[f"picture{i}"], c) for i, c in enumerate(cameras) if f"picture{i}" in got]
-    return pictures, got["done"].decode(), float(got["seconds"])
+    return got
 
 
 def _described(camera: Camera) -> dict[str, object]:
@@ -99,4 +175,4 @@ def _described(camera: Camera) -> dict[str, object]:
 
 
 def _picture(pixels: bytes, camera: Camera) -> np.ndarray:
-    return np.frombuffer(pixels, np.uint8).reshape(camera.height, camera.width, 4)[::-1, :, :3]
+    return np.frombuffer(pixels, np.uint8).reshape(camera.height, camera.width, 4)[:, :, :3]

@@ -67,9 +67,9 @@ def test_the_page_shows_what_the_renderer_does(name: str, browser: str, tmp_path
     (tmp_path / "scene.cgs").write_bytes(data)
     model = compgs.decode(tmp_path / "scene.cgs")
     cameras = cameras_around(content)
-    pictures, error = visit(browser, tmp_path / "browser", html_page(data, name), cameras)
-    assert error == ": " and len(pictures) == len(cameras)
-    for picture, camera in zip(pictures, cameras, strict=True):
+    seen = visit(browser, tmp_path / "browser", html_page(data, name), cameras)
+    assert seen.error == ": " and len(seen.pictures) == len(cameras)
+    for picture, camera in zip(seen.pictures, cameras, strict=True):
         image = compgs.render(model, camera).image
         expected = np.rint(np.clip(image, 0, 1) * 255)
         assert expected.std() > 10  # something is there to see
@@ -80,5 +80,5 @@ def test_the_page_shows_what_the_renderer_does(name: str, browser: str, tmp_path
 def test_a_damaged_file_is_named_in_the_page(browser: str, tmp_path: Path) -> None:
     data = bytearray(written(CONTENTS["paired"]))
     data[-40] ^= 1
-    _, error = visit(browser, tmp_path / "browser", html_page(bytes(data), "damaged"), [])
+    error = visit(browser, tmp_path / "browser", html_page(bytes(data), "damaged"), []).error
     assert error.startswith("This file is damaged: ") and "checksum does not match" in error

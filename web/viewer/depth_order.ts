@@ -22,7 +22,7 @@ export class DepthOrder {
     shift: number,
     cutoff: number,
     near: number,
-  ): Uint32Array {
+  ): Uint32Array<ArrayBuffer> {
     const total = opacities.length;
     if (this.keys.length < total) {
       this.keys = new Uint32Array(total);

@@ -12,7 +12,11 @@ export interface Eye {
 }
 
 export type ToWorker =
-  { kind: "bytes"; bytes: ArrayBuffer } | { kind: "url"; url: string } | { kind: "eye"; eye: Eye };
+  | { kind: "bytes"; bytes: ArrayBuffer }
+  | { kind: "url"; url: string }
+  | { kind: "eye"; eye: Eye }
+  /** The renderer is a new one, and has nothing of the scene. */
+  | { kind: "again" };
 
 /** What the page shows about a scene, and what a camera starts from. */
 export interface SceneInfo {
@@ -29,13 +33,14 @@ export interface SceneInfo {
 
 export type FromWorker =
   | { kind: "progress"; loaded: number; total: number | null }
-  | { kind: "scene"; info: SceneInfo; planes: Float32Array; rows: number }
+  | { kind: "scene"; info: SceneInfo }
+  | { kind: "geometry"; planes: Float32Array<ArrayBuffer>; rows: number }
   /** Primitives to draw, the farthest first; colors and opacities of some rows of them. */
   | {
       kind: "frame";
       id: number;
-      order: Uint32Array;
-      appearance: Float32Array | null;
+      order: Uint32Array<ArrayBuffer>;
+      appearance: Float32Array<ArrayBuffer> | null;
       firstRow: number;
       settled: boolean;
     }

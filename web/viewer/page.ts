@@ -1,7 +1,8 @@
 /** The page: a scene that is embedded in it, named by ?url=, chosen, or dropped onto it. */
 
 import type { SceneInfo } from "./messages.ts";
-import { NoWebGL2, Viewer } from "./viewer.ts";
+import type { RendererName } from "./renderer.ts";
+import { Viewer } from "./viewer.ts";
 
 const element = (id: string): HTMLElement => document.getElementById(id)!;
 
@@ -38,10 +39,14 @@ function explain(name: string, message: string): void {
     UnsupportedVersion: "This file is of another version",
     TruncatedSection: "This file is not complete",
     CorruptSection: "This file is damaged",
-    NoWebGL2: "This browser cannot show the scene",
+    CannotDraw: "This browser cannot show the scene",
     MissingDependency: "This file cannot be shown in a browser",
   };
-  sayError(titles[name] ?? "The scene cannot be shown", message);
+  const remedy = new URLSearchParams(location.search).has("renderer")
+    ? " Without renderer= in its address the page takes what there is."
+    : " Try a current version of Firefox, Chrome, Edge or Safari.";
+  const hint = name === "CannotDraw" ? remedy : "";
+  sayError(titles[name] ?? "The scene cannot be shown", message + hint);
 }
 
 function describe(info: SceneInfo): string {
@@ -51,9 +56,17 @@ function describe(info: SceneInfo): string {
   return `${splats} splats${share}`;
 }
 
+/** What ?renderer= asks for. */
+function askedRenderer(): RendererName | undefined {
+  const asked = new URLSearchParams(location.search).get("renderer");
+  if (asked === null || asked === "webgpu" || asked === "webgl2") return asked ?? undefined;
+  throw new Error(`The address asks for renderer=${asked}; there are webgpu and webgl2.`);
+}
+
 function start(): void {
   let described = "";
   const viewer = new Viewer(element("view"), {
+    renderer: askedRenderer(),
     onProgress(loaded, total) {
       element("bar").hidden = total !== null && loaded >= total;
       element("bar").style.width = total ? `${(100 * loaded) / total}%` : "100%";
@@ -136,6 +149,5 @@ try {
   start();
 } catch (error) {
   const { name, message } = error as Error;
-  const hint = error instanceof NoWebGL2 ? " Try a current version of Firefox, Chrome, Edge or Safari." : "";
-  explain(name, message + hint);
+  explain(name, message);
 }

@@ -1,17 +1,17 @@
-/** Numbers of the splats as the renderer's textures hold them. */
+/** Numbers of the splats as the renderers hold them. */
 
 import type { Appearance, Geometry } from "../src/prediction/predictor.ts";
-import { ROW } from "./shaders.ts";
+import { PLANES, ROW } from "./splatting.ts";
 
 export function rowsOf(primitives: number): number {
   return Math.max(1, Math.ceil(primitives / ROW));
 }
 
 /** Three planes of 4 floats: mean; covariance xx xy xz; covariance yy yz zz. */
-export function geometryPlanes({ means, quaternions, scales }: Geometry): Float32Array {
+export function geometryPlanes({ means, quaternions, scales }: Geometry): Float32Array<ArrayBuffer> {
   const count = means.length / 3;
   const plane = 4 * ROW * rowsOf(count);
-  const planes = new Float32Array(3 * plane);
+  const planes = new Float32Array(PLANES * plane);
   for (let p = 0; p < count; p++) {
     const covariance = covarianceOf(quaternions, scales, p);
     for (let i = 0; i < 3; i++) {
@@ -57,7 +57,7 @@ export function appearanceRows(
   appearance: Appearance,
   first: number,
   end: number,
-): { values: Float32Array; firstRow: number } {
+): { values: Float32Array<ArrayBuffer>; firstRow: number } {
   const { opacities, colors } = appearance;
   const firstRow = Math.floor(first / ROW);
   const rows = Math.max(1, Math.ceil(end / ROW) - firstRow);

@@ -1,22 +1,23 @@
-/** A scene in an element of a page: decodes in a worker, draws with WebGL2, follows mouse, touch and keys. */
+/** A scene in an element of a page: decodes in a worker, draws with WebGPU or WebGL2, follows mouse, touch and keys. */
 
 import type { Camera } from "../src/cameras.ts";
+import { chooseRenderer } from "./choose_renderer.ts";
 import { Controls } from "./controls.ts";
 import type { FromWorker, SceneInfo, ToWorker } from "./messages.ts";
 import { Pose, type Vector, add, dot } from "./pose.ts";
-import { type FrameCamera, Renderer } from "./renderer.ts";
+import type { FrameCamera, Renderer, RendererName } from "./renderer.ts";
 import workerSource from "compgs:worker";
 
-export { NoWebGL2 } from "./renderer.ts";
-
 export interface ViewerOptions {
+  /** What must draw; else WebGPU where the browser and its device have it, and WebGL2 elsewhere. */
+  renderer?: RendererName;
   /** Bytes of the file so far and of all, the latter if it is known. */
   onProgress?: (loaded: number, total: number | null) => void;
   /** A scene is there, or a finer version of it. */
   onScene?: (info: SceneInfo) => void;
   /** All bytes are there and sound. */
   onComplete?: (bytes: number) => void;
-  /** The file is damaged, or cannot be had. What has been shown of it stays. */
+  /** The file is damaged, or cannot be had: what has been shown of it stays. Or nothing can be drawn (CannotDraw). */
   onError?: (name: string, message: string) => void;
 }
 
@@ -24,9 +25,12 @@ const MOST_PIXELS_PER_CSS_PIXEL = 2;
 const FIELD_OF_VIEW = 0.9; // radians, of the smaller side, for files without viewpoints
 
 export class Viewer {
-  readonly canvas: HTMLCanvasElement;
   readonly controls: Controls;
-  private readonly renderer: Renderer;
+  /** Holds the canvas, which a lost device takes with it. */
+  private readonly stage: HTMLElement;
+  private renderer: Renderer | null = null;
+  /** The renderer has splats that frames may speak of. */
+  private hasSplats = false;
   private readonly worker: Worker;
   private readonly observer: ResizeObserver;
   private info: SceneInfo | null = null;
@@ -38,26 +42,30 @@ export class Viewer {
   /** A camera that stays until the controls move: its picture has exactly its size. */
   private fixed: Camera | null = null;
   private isTouched = false;
+  private isDisposed = false;
 
-  /** Throws NoWebGL2 where the browser cannot draw. */
   constructor(
     container: HTMLElement,
     private readonly options: ViewerOptions = {},
   ) {
-    this.canvas = document.createElement("canvas");
-    this.canvas.style.cssText = "display:block;width:100%;height:100%;outline:none";
-    this.renderer = new Renderer(this.canvas);
-    container.append(this.canvas);
-    this.canvas.addEventListener("webglcontextlost", () => {
-      options.onError?.("Error", "The browser has taken back its graphics memory. Load the page again.");
-    });
-    this.controls = new Controls(this.canvas, () => this.move());
+    this.stage = document.createElement("div");
+    this.stage.style.cssText = "width:100%;height:100%;outline:none";
+    container.append(this.stage);
+    this.controls = new Controls(this.stage, () => this.move());
     this.worker = new Worker(URL.createObjectURL(new Blob([workerSource], { type: "text/javascript" })));
-    this.worker.onmessage = ({ data }: MessageEvent<FromWorker>) => this.receive(data);
+    // The file is decoded in the meantime.
+    const isReady = this.equip(options.renderer);
+    this.worker.onmessage = async ({ data }: MessageEvent<FromWorker>) => {
+      if (await isReady) this.receive(data);
+    };
     this.worker.onerror = (event) => options.onError?.("Error", event.message);
     this.observer = new ResizeObserver(() => this.resize());
     this.observer.observe(container);
-    this.resize();
+  }
+
+  /** Where the scene is drawn, as soon as it is known what draws; another one after a device was lost. */
+  get canvas(): HTMLCanvasElement | null {
+    return this.renderer?.canvas ?? null;
   }
 
   /** Shows a file: its bytes, or the address to stream it from. */
@@ -79,7 +87,10 @@ export class Viewer {
     this.worker.terminate();
     this.controls.dispose();
     this.observer.disconnect();
-    this.canvas.remove();
+    this.stage.remove();
+    this.renderer?.dispose();
+    this.renderer = null;
+    this.isDisposed = true;
   }
 
   /** Goes to one of the file's viewpoints, counted from 0 and around. */
@@ -113,6 +124,45 @@ export class Viewer {
     });
   }
 
+  /** Whether there is something now that draws. */
+  private async equip(only?: RendererName): Promise<boolean> {
+    try {
+      const renderer = await chooseRenderer(only);
+      if (this.isDisposed) renderer.dispose();
+      else this.use(renderer);
+      return !this.isDisposed;
+    } catch (error) {
+      const { name, message } = error as Error;
+      this.options.onError?.(name, message);
+      return false;
+    }
+  }
+
+  private use(renderer: Renderer): void {
+    renderer.canvas.style.cssText = "display:block;width:100%;height:100%";
+    this.stage.replaceChildren(renderer.canvas);
+    this.renderer = renderer;
+    this.hasSplats = false;
+    if (this.info) renderer.background = this.info.background;
+    void renderer.lost.then((reason) => {
+      if (this.renderer === renderer) void this.replace(renderer, reason);
+    });
+    this.resize();
+  }
+
+  /** WebGL2 takes over from WebGPU, unless that must draw. */
+  private async replace(lost: Renderer, reason: string): Promise<void> {
+    if (lost.name === "webgl2" || this.options.renderer) {
+      const message = `The browser has taken back its graphics memory (${reason}). Load the page again.`;
+      this.options.onError?.("Error", message);
+      return;
+    }
+    console.warn(`WebGPU has stopped (${reason}). WebGL2 goes on with the drawing.`);
+    if (!(await this.equip("webgl2"))) return;
+    lost.dispose();
+    this.send({ kind: "again" });
+  }
+
   private move(): void {
     this.fixed = null;
     this.isTouched = true;
@@ -130,17 +180,14 @@ export class Viewer {
     else if (message.kind === "error") options.onError?.(message.name, message.message);
     else if (message.kind === "scene") {
       this.info = message.info;
-      renderer.background = message.info.background;
-      try {
-        renderer.setGeometry(message.planes, message.rows);
-      } catch (error) {
-        options.onError?.("Error", (error as Error).message);
-        return;
-      }
+      if (renderer) renderer.background = message.info.background;
+      this.controls.target ??= startOf(message.info, this.view);
       if (!this.isTouched) this.goTo(this.view);
       else this.changed();
       options.onScene?.(message.info);
-    } else {
+    } else if (!renderer) return;
+    else if (message.kind === "geometry") this.setGeometry(renderer, message.planes, message.rows);
+    else if (this.hasSplats) {
       if (message.appearance) renderer.setAppearance(message.appearance, message.firstRow);
       renderer.setOrder(message.order);
       if (message.settled) this.settledId = message.id;
@@ -148,11 +195,22 @@ export class Viewer {
     }
   }
 
+  private setGeometry(renderer: Renderer, planes: Float32Array<ArrayBuffer>, rows: number): void {
+    try {
+      renderer.setGeometry(planes, rows);
+      this.hasSplats = true;
+    } catch (error) {
+      this.hasSplats = false;
+      this.options.onError?.("Error", (error as Error).message);
+    }
+  }
+
   private resize(): void {
-    const { canvas, fixed } = this;
+    const { canvas, fixed, stage } = this;
+    if (!canvas) return;
     const ratio = Math.min(devicePixelRatio, MOST_PIXELS_PER_CSS_PIXEL);
-    const width = fixed ? fixed.width : Math.max(1, Math.round(canvas.clientWidth * ratio));
-    const height = fixed ? fixed.height : Math.max(1, Math.round(canvas.clientHeight * ratio));
+    const width = fixed ? fixed.width : Math.max(1, Math.round(stage.clientWidth * ratio));
+    const height = fixed ? fixed.height : Math.max(1, Math.round(stage.clientHeight * ratio));
     if (canvas.width !== width) canvas.width = width;
     if (canvas.height !== height) canvas.height = height;
     this.changed();
@@ -179,7 +237,8 @@ export class Viewer {
     requestAnimationFrame(() => {
       this.isDrawing = false;
       const camera = this.frameCamera();
-      if (camera) this.renderer.draw(camera);
+      if (!camera) return;
+      this.renderer?.draw(camera);
       if (this.settledId === this.eyeId) for (const resolve of this.waitingToSettle.splice(0)) resolve();
     });
   }
@@ -187,7 +246,7 @@ export class Viewer {
   private frameCamera(): FrameCamera | null {
     const { info, fixed, canvas } = this;
     const target = this.controls.target;
-    if (!info || !target) return null;
+    if (!info || !target || !canvas) return null;
     if (fixed) return inFrame(fixed, info.worldOffset);
     const { width, height } = canvas;
     const lens = info.viewpoints?.views[this.view];

@@ -8,10 +8,10 @@ import { chooseKernels } from "./choose_kernels.ts";
 import { DepthOrder } from "./depth_order.ts";
 import type { Eye, FromWorker, SceneInfo, ToWorker } from "./messages.ts";
 import { appearanceRows, geometryPlanes, rowsOf } from "./splat_planes.ts";
+import { NEAR } from "./splatting.ts";
 
 /** Coupled primitives whose opacity and color follow the camera in one frame. */
 const PART = 50_000;
-const NEAR = 0.01;
 
 interface Shown {
   predictor: Predictor;
@@ -38,7 +38,8 @@ let opened = 0;
 self.onmessage = ({ data }) => {
   if (data.kind === "bytes") void open(++opened, streamOf(new Uint8Array(data.bytes)), data.bytes.byteLength);
   else if (data.kind === "url") void openUrl(++opened, data.url);
-  else setEye(data.eye);
+  else if (data.kind === "eye") setEye(data.eye);
+  else if (shown) present(shown);
 };
 
 function setEye(next: Eye): void {
@@ -103,22 +104,21 @@ function report(ticket: number, error: unknown): void {
 
 function show(scene: Scene, chosen: Kernels): void {
   const predictor = new Predictor(scene, chosen);
-  shown = {
-    predictor,
-    appearance: predictor.newAppearance(),
-    nextAnchor: 0,
-    remaining: predictor.primitives.anchors,
-  };
-  const planes = geometryPlanes(predictor.geometry);
-  const message: FromWorker = {
-    kind: "scene",
-    info: infoOf(scene, predictor),
-    planes,
-    rows: rowsOf(scene.coupled),
-  };
-  // A finer scene takes the place of the coarser one in full: its first frame comes with it.
-  const frame = eye && frameOf(shown, eye, Infinity);
-  self.postMessage(message, [planes.buffer]);
+  shown = { predictor, appearance: predictor.newAppearance(), nextAnchor: 0, remaining: 0 };
+  self.postMessage({ kind: "scene", info: infoOf(scene, predictor) });
+  present(shown);
+}
+
+/** Everything that a renderer needs to draw a scene that it has nothing of. */
+function present(scene: Shown): void {
+  const { geometry, primitives } = scene.predictor;
+  scene.nextAnchor = 0;
+  scene.remaining = primitives.anchors;
+  const planes = geometryPlanes(geometry);
+  const rows = rowsOf(geometry.sound.length);
+  // Splats take the place of others in full: their first frame comes with them.
+  const frame = eye && frameOf(scene, eye, Infinity);
+  self.postMessage({ kind: "geometry", planes, rows }, [planes.buffer]);
   if (frame) post(frame);
 }
 
@@ -154,7 +154,7 @@ interface Frame {
 /** What is drawn for an eye, after at most `part` more coupled primitives have seen it. */
 function frameOf(scene: Shown, { id, centre, axis }: Eye, part: number): Frame {
   const { predictor, appearance } = scene;
-  let rows: { values: Float32Array; firstRow: number } | null = null;
+  let rows: { values: Float32Array<ArrayBuffer>; firstRow: number } | null = null;
   if (scene.remaining) {
     const { firstCoupled, anchors } = predictor.primitives;
     const first = scene.nextAnchor;

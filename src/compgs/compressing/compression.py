@@ -25,7 +25,7 @@ from compgs.compressing.surroundings import Lens
 from compgs.compressing.teacher import teacher_scene
 from compgs.config import Config, check_config, load_config
 from compgs.devices import chosen_device
-from compgs.errors import CheckpointError, ConfigError, NotACompGSFile, OutputError
+from compgs.errors import CheckpointError, ConfigError, NotACompGSFile, OutputError, SplatFileError
 from compgs.evaluation import evaluate
 from compgs.evaluation.results import Results
 from compgs.formats import component_bytes, format_of, open_scene
@@ -233,7 +233,10 @@ def opened(source: Path, looking: Looking, device: str | None) -> SplatModel:
             f"{source}: a .cgs file is compressed already; `compgs encode` makes one smaller without training"
         )
     model = open_scene(source, chosen_device(device), looking.background)
-    assert isinstance(model, SplatModel), type(model)
+    if not isinstance(model, SplatModel):
+        raise SplatFileError(
+            f"{source}: its splats are made anew for each camera by networks; expected splats that stay as they are"
+        )
     return model
 
 

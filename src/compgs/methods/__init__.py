@@ -52,12 +52,15 @@ a run that was stopped and continued (`tests/methods`).
 """
 
 from compgs.methods import hybrid, splats
+from compgs.methods.c3dgs import C3DGS
 from compgs.methods.compact3d import COMPACT3D
 from compgs.methods.compact_3dgs import COMPACT_3DGS
 from compgs.methods.cosa import COSA
 from compgs.methods.eagles import EAGLES
+from compgs.methods.lightgaussian import LIGHTGAUSSIAN
 from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
 from compgs.methods.running import settings_of, train, write
+from compgs.methods.scaffold_gs import SCAFFOLD_GS
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -67,8 +70,11 @@ METHODS: dict[str, Method] = {
         splats.SPZ,
         splats.SOG,
         COMPACT3D,
+        C3DGS,
+        LIGHTGAUSSIAN,
         EAGLES,
         COMPACT_3DGS,
+        SCAFFOLD_GS,
         COSA,
     )
 }

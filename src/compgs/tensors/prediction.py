@@ -12,8 +12,9 @@ Everything runs on any device, in any precision, with gradients; on the CPU in f
 
 import contextlib
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -35,6 +36,44 @@ class Prediction:
     index: Tensor  # [M] int64, ascending: which coupled primitives (of P) they are
     opacities: Tensor  # [P] of all coupled primitives; not above 0: not drawn
     drawn: Tensor | None = None  # [M] bool: those that are drawn, of opacity above 0; None: all M
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Of all P coupled primitives, drawn or not: what is the same from everywhere."""
+
+    means: Tensor  # [P, 3] world units
+    scales: Tensor  # [P, 3] standard deviations, world units
+    quaternions: Tensor  # [P, 4]
+
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Means, scales and quaternions."""
+        return self.means, self.scales, self.quaternions
+
+    def cut(self) -> "Geometry":
+        """The same as leaves of another graph: gradients of what is made of them end there."""
+        return Geometry(*(tensor.detach().requires_grad_() for tensor in self.tensors()))
+
+    def of(self, rows: Tensor | None) -> "Geometry":
+        """Of the rows [M] int64, each of them once; None: of all."""
+        return self if rows is None else Geometry(*(_Rows.apply(tensor, rows) for tensor in self.tensors()))
+
+
+class _Rows(torch.autograd.Function):
+    """`index_select` of rows that come once each: its gradient is copied, not summed by one thread."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, rows: Tensor) -> Tensor:
+        ctx.save_for_backward(rows)
+        ctx.count = len(x)
+        return x.index_select(0, rows)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        (rows,) = ctx.saved_tensors
+        result = grads[0].new_zeros(ctx.count, *grads[0].shape[1:])
+        result[rows] = grads[0]
+        return result, None
 
 
 @functools.lru_cache(maxsize=4096)
@@ -119,15 +158,19 @@ def predict(
     *,
     compact: bool = True,
     appearance_dtype: torch.dtype = torch.float32,
+    geometry: Geometry | None = None,
 ) -> Prediction:
     """Gaussians of all coupled primitives that can be seen from a camera (Sec. 3.2).
 
     `weights`: other parameter values for the heads (as they will be stored), by name. Not `compact`: all coupled
     primitives, those that are not drawn with opacity 0; the same image and gradients by more arithmetic, but a GPU need
     not be waited for to learn how many there are. `appearance_dtype`: of the networks of opacity and color.
+    `geometry`: of these primitives, where several views share it.
     """
     seen = see(primitives.references, primitives.positions, camera_center, distance_unit)
-    function = _drawn if compact else _all
+    function: Callable[..., Prediction] = _drawn if compact else _all
+    if geometry is not None:
+        function = functools.partial(predict_by_torch, compact=compact, geometry=geometry)
     if weights is None:
         return function(heads, primitives, seen, appearance_dtype)
     arguments = function, primitives, seen, appearance_dtype
@@ -156,11 +199,15 @@ def predict_by_torch(
     appearance_dtype: torch.dtype = torch.float32,
     *,
     compact: bool = True,
+    geometry: Geometry | None = None,
 ) -> Prediction:
     """`predict` by the heads as they are, in plain torch (the networks alone run in kernels where they can)."""
     p = primitives
     a = predict_appearance(heads, seen, p.residuals, p.anchor_index, dtype=appearance_dtype, compact=compact)
-    means, scales, quaternions = predict_geometry(heads, p, a.residuals, a.anchor)
+    if geometry is None:
+        means, scales, quaternions = predict_geometry(heads, p, a.residuals, a.anchor)
+    else:
+        means, scales, quaternions = geometry.of(a.index).tensors()
     gaussians = Gaussians(means, quaternions, scales, a.opacities, a.colors)
     if a.index is not None:
         return Prediction(gaussians, a.index, a.all_opacities)
@@ -219,6 +266,11 @@ def predict_geometry(
         p.reach.index_select(0, anchor),
         p.sizes.index_select(0, anchor),
     )
+
+
+def geometry_of_all(heads: "PredictionHeads", primitives: Primitives) -> Geometry:
+    """Of all coupled primitives."""
+    return Geometry(*predict_geometry(heads, primitives, primitives.residuals, primitives.anchor_index))
 
 
 # where it runs ---------------------------------------------------------------------------------

@@ -146,7 +146,7 @@ def check_identical(step: int, tensors: Mapping[str, Tensor]) -> None:
     """Raises TrainingError on all ranks if what they have in common is not the same to the last bit."""
     if world() == 1:
         return
-    own = torch.tensor([_digest(tensor) for tensor in tensors.values()], dtype=torch.int64)
+    own = torch.tensor([digest(tensor) for tensor in tensors.values()], dtype=torch.int64)
     found = [torch.empty_like(own) for _ in range(world())]
     with _journey():
         dist.all_gather(found, own)
@@ -175,7 +175,8 @@ def stopping_together() -> Iterator[None]:
         raise stop or KeyboardInterrupt
 
 
-def _digest(tensor: Tensor) -> int:
+def digest(tensor: Tensor) -> int:
+    """64 bits that stand for its content."""
     content = tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().data
     return int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "little", signed=True)
 

@@ -45,6 +45,8 @@ class Hooks(nn.Module):
     # Names of parameters and buffers [M, ...] with a row for each splat: the rows follow when splats are cloned, split
     # or removed. A new splat has the row of the one it came from.
     per_splat: tuple[str, ...] = ()
+    # By which all learning rates are multiplied at the end of the phase (exponential from 1), beside their own decay.
+    slowing: float = 1.0
 
     def begin(self, trainer: "SplatTrainer") -> None:
         """Before the first step, not when a run is resumed: make what depends on the splats there are."""

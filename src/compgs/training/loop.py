@@ -19,7 +19,7 @@ from compgs.losses import Target, exposed
 from compgs.render import RasterResult, RasterSettings, Renderable
 from compgs.tensors.rasterize import rasterize
 from compgs.training.allocation import freed_memory_kept
-from compgs.training.checkpoint import CHECKPOINT_NAME
+from compgs.training.checkpoint import CHECKPOINT_NAME, Writer
 from compgs.training.distributed import local_device, on_any_rank, rank, stopping_together
 from compgs.training.profile import StepProfile
 
@@ -106,8 +106,8 @@ class Trains(Protocol):
 
     def finish(self) -> None: ...
 
-    def save(self, path: Path | None) -> None:
-        """Write a checkpoint. On all ranks at once; None on those that do not write."""
+    def save(self, path: Path | None, writer: Writer | None = None) -> None:
+        """Write a checkpoint, or let the writer do it. On all ranks at once; None on those that do not write."""
         ...
 
 
@@ -187,12 +187,15 @@ class Saving:
     A run that takes the place of an earlier one leaves the earlier checkpoint until it has been going for long enough
     to write one of its own: whoever stops it at once keeps what there was.
 
-    Of several ranks only rank 0 writes, and decides, but a checkpoint needs all of them.
+    Those on the way are written beside the steps that follow. Of several ranks only rank 0 writes, and decides, but a
+    checkpoint needs all of them.
     """
 
     def __init__(self, trainer: Trains, path: Path | None, minutes: float) -> None:
         self.trainer = trainer
         self.path = path
+        self.writer = Writer()
+        self.begun = False
         self.seconds = 60 * minutes
         self.saved = time.perf_counter()
         (self.writes,) = on_any_rank(path is not None)
@@ -201,22 +204,41 @@ class Saving:
     def due(self) -> bool:
         if not self.writes:
             return False
-        (due,) = on_any_rank(self.path is not None and time.perf_counter() - self.saved > self.seconds)
+        waited = time.perf_counter() - self.saved > self.seconds
+        (due,) = on_any_rank(self.path is not None and waited and not self.begun)
         return due
 
-    def save(self) -> float:
+    def save(self, writer: Writer | None = None) -> float:
         """Seconds that it took. Whoever stops the run meanwhile is heard when the checkpoint is whole."""
         start = time.perf_counter()
         if self.writes:
             with held_back():
-                self.trainer.save(self.path)
+                self.trainer.save(self.path, writer)
         self.saved, self.replaces = time.perf_counter(), False
         return self.saved - start
+
+    def begin(self) -> float:
+        """Let a checkpoint be written while the run goes on; seconds that it waited."""
+        self.begun = self.path is not None
+        return self.save(self.writer)
+
+    def last(self) -> None:
+        """The checkpoint of the end."""
+        with held_back():
+            self.writer.finish()
+            self.save()
+
+    def ended(self) -> bool:
+        """Whether one that was begun has been written since this was asked last. Raises OutputError if it could not."""
+        ended = self.begun and not self.writer.busy
+        self.begun = self.begun and not ended
+        self.writer.check()
+        return ended
 
     def stopped(self) -> None:
         """Save, unless an earlier run's checkpoint would be lost."""
         if not self.replaces:
-            self.save()
+            self.last()
 
 
 @freed_memory_kept()
@@ -228,8 +250,8 @@ def run_to_end(
     watch: Watch | None = None,
 ) -> None:
     """All remaining steps; checkpoints at `path` as `Saving` says. Progress is reported now and then, and right after
-    each checkpoint. What `watch` does takes its time, and changes nothing. Of several ranks rank 0 alone writes and
-    reports."""
+    each checkpoint. What `watch` does takes its time, and changes nothing. Of several ranks rank 0 alone writes
+    and reports."""
     if rank() > 0:
         path, on_progress, watch = None, None, None
     saving, pace, estimate = Saving(trainer, path, config.checkpoint_minutes), Pace(), 0
@@ -239,13 +261,13 @@ def run_to_end(
                 with held_back():
                     result = trainer.train_step()
                 pace.step()
+                told = trainer.step % REPORT_EVERY == 0 or trainer.step == config.steps or saving.ended()
                 saves = saving.due()
-                told = trainer.step % REPORT_EVERY == 0 or trainer.step == config.steps or saves
                 # Before anything is computed from what has diverged.
-                if told and not torch.isfinite(result.loss):
+                if (told or saves) and not torch.isfinite(result.loss):
                     raise diverged(trainer.step, "loss", float(result.loss))
                 if saves:
-                    pace.pause(saving.save())
+                    pace.pause(saving.begin())
                 if on_progress and told:
                     seconds = pace.look()
                     if trainer.step % ESTIMATE_EVERY == 0 or not estimate:
@@ -258,7 +280,7 @@ def run_to_end(
     except KeyboardInterrupt:
         saving.stopped()
         raise
-    saving.save()
+    saving.last()
 
 
 def _status(trainer: Trains, steps: int, result: StepResult, estimate: int, pace: float) -> TrainingStatus:

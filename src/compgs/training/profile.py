@@ -24,7 +24,9 @@ Stations = Callable[..., Iterable[tuple[str, tuple[Tensor, ...]]]]
 class StepProfile:
     """Seconds by part, summed over steps."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, warm_up: int = WARM_UP, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.warm_up = warm_up
+        self.clock = clock
         self.seconds: dict[str, float] = defaultdict(float)
         self.steps = 0
         self._seen = 0
@@ -49,7 +51,7 @@ class StepProfile:
             self._last = self._now()
             result = step()
             self._seen += 1
-            self.steps += self._seen > WARM_UP
+            self.steps += self._seen > self.warm_up
             return result
 
         trainer.backward, trainer.train_step = watched_backward, watched_step
@@ -70,7 +72,7 @@ class StepProfile:
     def _lap(self, part: str) -> None:
         """What happened since the last lap was `part`."""
         now = self._now()
-        if self._seen >= WARM_UP:
+        if self._seen >= self.warm_up:
             self.seconds[part] += now - self._last
         self._last = now
 
@@ -88,8 +90,7 @@ class StepProfile:
         for tensor in waiting:
             tensor.register_hook(arrived)
 
-    @staticmethod
-    def _now() -> float:
+    def _now(self) -> float:
         if torch.cuda.is_available():
             torch.cuda.synchronize()
-        return time.perf_counter()
+        return self.clock()

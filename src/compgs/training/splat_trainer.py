@@ -27,6 +27,7 @@ from compgs.scene.world import local_scene, world_offset
 from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
 from compgs.tensors.visibility import visible_mask
 from compgs.training.checkpoint import (
+    Writer,
     check_same_run,
     optimizer_tensors,
     read_checkpoint_file,
@@ -223,10 +224,14 @@ class SplatTrainer:
         """
         exposures = self.views.exposure_gradients(views)
         sum_gradients(parameters_of(self.optimizer), loss, *exposures)
-        set_learning_rates(self.optimizer, self.progress, exponential_decay)
+        set_learning_rates(self.optimizer, self.progress, self.learning_rate)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.views.learn(self.progress, views, exposures)
+
+    def learning_rate(self, first: float, last: float, progress: float) -> float:
+        """Of a group, at some progress of the phase."""
+        return exponential_decay(first, last * self.hooks.slowing, progress)
 
     def observe(self, rendered: RasterResult, camera: Camera) -> None:
         if self.schedule.active(self.step) and rendered.means2d.grad is not None:
@@ -249,7 +254,8 @@ class SplatTrainer:
 
     def check_ranks(self) -> None:
         """Raises TrainingError if the ranks of a torchrun have come to hold different splats."""
-        check_identical(self.step, self.named_parameters())
+        own = {HOOKS + name: value for name, value in hook_state(self.hooks).items()}
+        check_identical(self.step, {**self.named_parameters(), **own})
 
     @torch.no_grad()
     def as_drawn(self) -> Splats:
@@ -304,12 +310,12 @@ class SplatTrainer:
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
-    def save(self, path: Path | None) -> None:
+    def save(self, path: Path | None, writer: Writer | None = None) -> None:
         with whole(self.control, DensityControl.STATISTICS):
             if path is not None:
-                self.write(path)
+                self.write(path, writer)
 
-    def write(self, path: Path) -> None:
+    def write(self, path: Path, writer: Writer | None) -> None:
         tensors = {f"model/{name}": p for name, p in vars(self.parameters.trained()).items()}
         moments = optimizer_tensors(self.named_parameters(), self.optimizer)
         tensors |= {f"optimizer/{name}": value for name, value in moments.items()}
@@ -324,7 +330,7 @@ class SplatTrainer:
             "world_offset": self.world_offset,
         }
         metadata = {"config": json.dumps(self.config.to_dict()), "state": json.dumps(state)}
-        write_checkpoint_file(path, self.method, tensors, metadata)
+        write_checkpoint_file(path, self.method, tensors, metadata, writer)
 
     def named_parameters(self) -> dict[str, nn.Parameter]:
         """All that is trained."""

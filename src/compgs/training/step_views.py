@@ -30,7 +30,7 @@ class SeenAnchors:
     @property
     def numbers(self) -> list[int]:
         """Of the views that may show any."""
-        return [number for number in self.parts if len(self.rows_of(number))]
+        return [n for n, part in self.parts.items() if len(self.rows if part is None else part)]
 
     def part_of(self, number: int) -> Tensor | None:
         """[V] int64: the entries of `rows` that a view may show; None: all."""

@@ -1,7 +1,8 @@
 """Rate-distortion optimization of one scene (CompGS Sec. 3.4): a loop short enough to read aloud."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -29,9 +30,11 @@ from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
 from compgs.tensors.prediction import (
+    Geometry,
     Prediction,
     camera_center,
     choosing_pays,
+    geometry_of_all,
     predict,
     predict_geometry,
 )
@@ -39,6 +42,7 @@ from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
 from compgs.training.checkpoint import (
     Checkpoint,
+    Writer,
     check_same_run,
     load_checkpoint,
     optimizer_tensors,
@@ -182,7 +186,8 @@ class Trainer:
             return self.nothing_shown(looks)
         latents = self.quantize(looks)
         shown = latents.cut()
-        results = [self.learn_from(shown, looks, number) for number in looks.own.numbers]
+        with self.shared_geometry(shown, looks) as geometry:
+            results = [self.learn_from(shown, geometry, looks, number) for number in looks.own.numbers]
         rate = self.rate_of(latents, looks)
         self.pull(latents, shown, rate)
         loss = torch.stack([result.loss for result in results]).sum()
@@ -190,12 +195,39 @@ class Trainer:
             loss = rate_distortion_loss(loss, rate.detach(), self.rate.lmbda)
         return replace(results[-1], loss=loss)
 
-    def learn_from(self, shown: Quantized, looks: StepViews, number: int) -> StepResult:
+    @contextmanager
+    def shared_geometry(self, shown: Quantized, looks: StepViews) -> Iterator[Geometry | None]:
+        """Where several views are looked at: the geometry of their primitives, predicted once. After them its gradients
+        go on to the latents and the heads. A single view predicts that of what it shows.
+        """
+        if len(looks.own.numbers) == 1:
+            yield None
+            return
+        geometry = self.predict_shared(shown, looks.own.rows)
+        cut = geometry.cut()
+        yield cut
+        pull_back(geometry.tensors(), cut.tensors())
+
+    def predict_shared(self, shown: Quantized, rows: Tensor) -> Geometry:
+        heads, primitives = self.model.heads, self.model.primitives(shown, rows)
+        if not self.stored:
+            return geometry_of_all(heads, primitives)
+        weights = self.model.stored_head_weights()
+        found: Geometry = torch.func.functional_call(heads, weights, (geometry_of_all, primitives))
+        return found
+
+    def learn_from(
+        self, shown: Quantized, geometry: Geometry | None, looks: StepViews, number: int
+    ) -> StepResult:
         """One of the step's views: its gradients by the latents, the heads and its exposure."""
         view, part = looks.views[number], looks.own.part_of(number)
         camera, photograph = self.scene.train_views[view].camera, self.views.photograph(view)
         rows = looks.own.rows_of(number)
-        prediction, gaussians = self.predict_some(shown.of(part), rows, camera, looks.noise_of_view(number))
+        if geometry is not None:
+            geometry = geometry.of(None if part is None else self.model.slots(part))
+        prediction, gaussians = self.predict_some(
+            shown.of(part), rows, camera, looks.noise_of_view(number), geometry
+        )
         rendered = self.rasterize(gaussians, camera)
         loss = self.compare(rendered, photograph) + self.regularize(prediction, gaussians, camera)
         self.backward(loss, rendered, gaussians)
@@ -229,13 +261,20 @@ class Trainer:
         return self.progress >= self.config.training.quantized_weights
 
     def predict_some(
-        self, latents: Quantized, rows: Tensor, camera: Camera, noise: Noise
+        self, latents: Quantized, rows: Tensor, camera: Camera, noise: Noise, geometry: Geometry | None
     ) -> tuple[Prediction, Gaussians]:
         """What the view may show (Sec. 3.2), and its Gaussians without those that chance leaves out of this step."""
-        prediction = self.predict(latents, rows, camera, self.stored)
+        prediction = self.predict(latents, rows, camera, self.stored, geometry)
         return prediction, thinned(prediction, self.left_out, noise)
 
-    def predict(self, latents: Quantized, rows: Tensor, camera: Camera, stored: bool) -> Prediction:
+    def predict(
+        self,
+        latents: Quantized,
+        rows: Tensor,
+        camera: Camera,
+        stored: bool,
+        geometry: Geometry | None = None,
+    ) -> Prediction:
         """On the GPU all primitives of the anchors in view: to choose among them the CPU would have to wait for it."""
         model = self.model
         return predict(
@@ -246,6 +285,7 @@ class Trainer:
             model.stored_head_weights() if stored else None,
             compact=choosing_pays(self.device),
             appearance_dtype=getattr(torch, self.config.training.appearance_dtype),
+            geometry=geometry,
         )
 
     def rasterize(self, gaussians: Gaussians, camera: Camera) -> RasterResult:
@@ -276,14 +316,12 @@ class Trainer:
         """D + lambda R (Eq. 1): what the views ask of the latents, and what the rate does, through the entropy model to
         the anchors. With lambda 0 only the entropy model learns R.
         """
-        pairs = zip(latents.latents(), shown.latents(), strict=True)
-        asked: list[tuple[Tensor, Tensor | None]]
-        asked = [(latent, leaf.grad) for latent, leaf in pairs if leaf.grad is not None]
         if rate is not None and self.rate.lmbda > 0:
-            asked.append((self.rate.lmbda * rate, None))
+            rate = self.rate.lmbda * rate
         elif rate is not None:
             rate.backward(inputs=self.model.entropy.statistics(), retain_graph=True)
-        torch.autograd.backward([tensor for tensor, _ in asked], [gradient for _, gradient in asked])
+            rate = None
+        pull_back(latents.latents(), shown.latents(), rate)
 
     def update(self, looks: StepViews, loss: Tensor) -> None:
         """Adam's step, after views of the anchors in `looks`; each channel of the references by its own rate.
@@ -429,12 +467,12 @@ class Trainer:
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
-    def save(self, path: Path | None) -> None:
+    def save(self, path: Path | None, writer: Writer | None = None) -> None:
         with whole(self.control, AdaptiveControl.STATISTICS):
             if path is not None:
-                self.write(path)
+                self.write(path, writer)
 
-    def write(self, path: Path) -> None:
+    def write(self, path: Path, writer: Writer | None) -> None:
         extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
         extra["chance"] = self.chance.get_state()
         extra |= self.views.tensors()
@@ -448,7 +486,7 @@ class Trainer:
             "rate": asdict(self.rate),
         }
         moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
-        save_checkpoint(path, Checkpoint(self.model, moments, extra, state))
+        save_checkpoint(path, Checkpoint(self.model, moments, extra, state), writer)
 
     @classmethod
     def resumed(cls, scene: Scene, path: Path, config: Config, device: torch.device) -> "Trainer":
@@ -476,6 +514,19 @@ class Trainer:
         return trainer
 
 
+def pull_back(tensors: Sequence[Tensor], leaves: Sequence[Tensor], loss: Tensor | None = None) -> None:
+    """Lead the gradients of `leaves`, which were cut from the `tensors`, and those of a `loss` [] on through the graph
+    of these.
+    """
+    asked: list[tuple[Tensor, Tensor | None]]
+    asked = [
+        (tensor, leaf.grad) for tensor, leaf in zip(tensors, leaves, strict=True) if leaf.grad is not None
+    ]
+    if loss is not None:
+        asked.append((loss, None))
+    torch.autograd.backward([tensor for tensor, _ in asked], [gradient for _, gradient in asked])
+
+
 def vanishing_loss(prediction: Prediction) -> Tensor | float:
     """Keeps a scene of which hardly anything is drawn from vanishing; 0 otherwise."""
     if prediction.drawn is not None:
@@ -490,6 +541,7 @@ def vanishing_loss(prediction: Prediction) -> Tensor | float:
 PARTS = {
     "visible_anchors": "culling",
     "quantize": "entropy",
+    "predict_shared": "prediction",
     "predict_some": "prediction",
     "rasterize": "projection and rasterization",
     "regularize": "loss",

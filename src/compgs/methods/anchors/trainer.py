@@ -1,6 +1,7 @@
 """Training of such anchors without rate; methods add theirs (`training/loop.py` has the loop)."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
+from compgs.errors import ConfigError
 from compgs.gaussians import Gaussians
 from compgs.losses import Target, photometric_loss, scale_regularizer, scale_unit
 from compgs.methods.anchors.model import AnchorModel, control_settings, initial_anchors
@@ -21,6 +23,7 @@ from compgs.scene.world import local_scene
 from compgs.tensors.prediction import Prediction, camera_center
 from compgs.tensors.visibility import visible_mask
 from compgs.training.checkpoint import (
+    Writer,
     check_same_run,
     optimizer_tensors,
     read_checkpoint_file,
@@ -29,6 +32,7 @@ from compgs.training.checkpoint import (
     write_checkpoint_file,
 )
 from compgs.training.control import AdaptiveControl, make_schedule
+from compgs.training.distributed import world
 from compgs.training.loop import Run, StepResult, rasterize_step, run_to_end
 from compgs.training.optimizers import ADAM_EPSILON, DECAYS, set_learning_rates
 from compgs.training.restoring import (
@@ -47,7 +51,7 @@ from compgs.training.views_in_turn import ViewsInTurn
 
 
 class AnchorTrainer:
-    """State of a run: model, optimizer, control, and the order in which views come.
+    """State of a run: model, optimizer, control, and the order in which views come, one a step.
 
         values ──predict──► Gaussians ──rasterize──► image ──compare, + added──► loss ──► step ──► finish_step
 
@@ -67,6 +71,11 @@ class AnchorTrainer:
         model: AnchorModel | None = None,
     ) -> None:
         t = config.training
+        if world() > 1 or t.views_per_step > 1:
+            raise ConfigError(
+                f"method {method} trains in one process, with one view a step; found {world()} and "
+                f"{t.views_per_step}: start it without torchrun, and without training.views_per_step"
+            )
         self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure)
         self.config = config
         self.device = device
@@ -117,14 +126,11 @@ class AnchorTrainer:
         if len(rows) == 0:
             return self.skip(photograph)
         prediction = self.predict(values.rows(rows), camera)
-        rendered = rasterize_step(
-            prediction.gaussians, camera, self.settings, watched=self.schedule.active(self.step)
-        )
-        loss = photometric_loss(rendered.image, photograph, self.config.training.ssim_weight)
-        loss = loss + self.regularize(prediction, prediction.gaussians, camera)
+        rendered = self.rasterize(prediction.gaussians, camera)
+        loss = self.compare(rendered, photograph) + self.regularize(prediction, camera)
         added = self.added()
         loss = loss if added is None else loss + added
-        loss.backward()
+        self.backward(loss, rendered, prediction.gaussians)
         self.update(index)
         self.observe(rows, prediction, rendered, camera)
         self.finish_step()
@@ -151,8 +157,15 @@ class AnchorTrainer:
     def predict(self, values: AnchorValues, camera: Camera) -> Prediction:
         return predict_anchors(self.weights(), values, camera_center(camera, self.device), self.model.frame)
 
-    def regularize(self, prediction: Prediction, gaussians: Gaussians, camera: Camera) -> Tensor:
+    def rasterize(self, gaussians: Gaussians, camera: Camera) -> RasterResult:
+        return rasterize_step(gaussians, camera, self.settings, watched=self.schedule.active(self.step))
+
+    def compare(self, rendered: RasterResult, target: Target) -> Tensor:
+        return photometric_loss(rendered.image, target, self.config.training.ssim_weight)
+
+    def regularize(self, prediction: Prediction, camera: Camera) -> Tensor:
         """Penalties on large primitives and on a vanishing scene."""
+        gaussians = prediction.gaussians
         unit = scale_unit(gaussians.means, camera_center(camera, self.device), self.scene.extent)
         volumes = scale_regularizer(gaussians.scales / unit, prediction.drawn)
         return self.config.training.scale_weight * volumes + self.vanishing(prediction)
@@ -161,12 +174,17 @@ class AnchorTrainer:
         """Keeps a scene of which hardly anything is drawn from vanishing."""
         return vanishing_loss(prediction)
 
+    def backward(self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians) -> None:
+        """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
+        loss.backward()
+
     def update(self, view: int) -> None:
         t = self.config.training
+        exposures = self.views.exposure_gradients([view])
         set_learning_rates(self.optimizer, self.progress, DECAYS[t.schedule], t.head_warm_up)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        self.views.learn(self.progress, [view], self.views.exposure_gradients([view]))
+        self.views.learn(self.progress, [view], exposures)
 
     def observe(self, rows: Tensor, prediction: Prediction, rendered: RasterResult, camera: Camera) -> None:
         """The statistics that growth and pruning go by."""
@@ -206,7 +224,7 @@ class AnchorTrainer:
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
-    def save(self, path: Path | None) -> None:
+    def save(self, path: Path | None, writer: Writer | None = None) -> None:
         assert path is not None, "it trains in one process"
         tensors = {f"model/{name}": value for name, value in self.model.state_dict().items()}
         moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
@@ -221,7 +239,7 @@ class AnchorTrainer:
             "frame": json.dumps(frame),
             "state": json.dumps(state),
         }
-        write_checkpoint_file(path, self.method, tensors, metadata)
+        write_checkpoint_file(path, self.method, tensors, metadata, writer)
 
     def more_state(self) -> dict[str, Any]:
         """What else a checkpoint says, as JSON takes it."""
@@ -282,5 +300,32 @@ def train_anchors(kind: type[AnchorTrainer], scene: Scene, config: Config, run: 
         trainer = kind.resumed(scene, run.earlier, config, run.device, run.method)
     else:
         trainer = kind(scene, config, run.device, run.method)
+    if run.profile is not None:
+        run.profile.watch(trainer, PARTS, stations)
     trainer.run(run)
     return trainer.model
+
+
+# What a profile calls the parts of a step.
+PARTS = {
+    "values": "quantization and entropy",
+    "visible_anchors": "culling",
+    "predict": "prediction",
+    "rasterize": "projection and rasterization",
+    "compare": "loss",
+    "regularize": "loss",
+    "added": "quantization and entropy",
+    "backward": "prediction and entropy, backward",
+    "update": "optimizer",
+    "observe": "control",
+    "finish_step": "control",
+}
+
+
+def stations(
+    loss: Tensor, rendered: RasterResult, gaussians: Gaussians
+) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
+    """Where the gradients of a step arrive, part by part."""
+    yield "loss, backward", (rendered.image,)
+    yield "rasterization, backward", (rendered.means2d,)
+    yield "projection, backward", (gaussians.means, gaussians.quaternions, gaussians.scales)

@@ -10,7 +10,6 @@
 """
 
 import functools
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -167,7 +166,7 @@ def _network(packed: Packed) -> ColorNetwork:
     shapes = network_shapes(layout.width)
     weights = [_finite(packed, f"weights.{i}", np.float16, shape) for i, shape in enumerate(shapes)]
     grid = _finite(packed, "grid", np.float16, (layout.total, layout.features))
-    middle = np.array(_place(packed, "middle"), np.float32)
+    middle = np.array(stored_place(packed, "middle"), np.float32)
     return ColorNetwork(layout, grid, tuple(weights), middle, unit)
 
 
@@ -187,16 +186,6 @@ def _finite(packed: Packed, name: str, kind: type[np.generic], shape: tuple[int 
     if not np.isfinite(array).all():
         raise SplatFileError(f"{packed.path}: {name}: hold what is not a finite number; copy it again")
     return array
-
-
-def _place(packed: Packed, name: str) -> tuple[float, float, float]:
-    """Raises SplatFileError."""
-    found = packed.facts.get(name)
-    numbers = found if isinstance(found, list) and len(found) == 3 else []
-    if not numbers or not all(type(n) in (int, float) and math.isfinite(n) for n in numbers):
-        raise SplatFileError(f"{packed.path}: {name}: expected three numbers, found {found!r:.60}")
-    x, y, z = map(float, numbers)
-    return x, y, z
 
 
 def _half(values: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from compgs.methods.parts.vector_quantization import residual_codes, residual_la
 from compgs.scene.views import Scene
 from compgs.tensors.splats import Splats
 from compgs.training import Drawn, Hooks, Phase, Run, SplatTrainer, train_phases
+from compgs.training.optimizers import rates_for
 from compgs.training.splat_trainer import HOOKS
 
 FIRST_MASK = 1.0  # logit
@@ -87,9 +88,10 @@ class Compact(Hooks):
         self.camera = camera
         fallen = sum(trainer.progress >= at for at in self.config.color_lr_falls)
         rate = self.config.color_lr * FALL**fallen
+        rates = rates_for(trainer.config.training.views_per_step, (rate, rate))
         for group in trainer.optimizer.param_groups:
             if group["name"].removeprefix(HOOKS) in ("grid", *self.weight_names):
-                group["rates"] = (rate, rate)
+                group["rates"] = rates
         return camera, photograph
 
     def transform(self, splats: Splats, trainer: SplatTrainer) -> Splats:

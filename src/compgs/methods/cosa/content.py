@@ -8,7 +8,6 @@ import numpy as np
 from compgs.codec.integer_network import FRACTION_BITS, IntegerNetwork
 from compgs.codec.weights import QuantizedTensor
 from compgs.methods.anchors.scene import AnchorScene, Frame
-from compgs.methods.cosa.chain import coordinate_inputs
 from compgs.methods.cosa.shape import ChainShape
 
 
@@ -28,11 +27,6 @@ class CosaContent:
     symbols: tuple[np.ndarray, ...]  # as they are coded, one after the other
     tables: tuple[np.ndarray, ...]  # of these symbols
     weights: Mapping[str, QuantizedTensor]  # of the rendering networks
-
-    @property
-    def places(self) -> np.ndarray:
-        """[N, 3] Q12 what the chain takes of the coordinates."""
-        return coordinate_inputs(self.coordinates, np.array(self.origin, np.int64), self.depth)
 
 
 def scene_of(content: CosaContent) -> AnchorScene:

@@ -78,18 +78,18 @@ def _content(packed: Packed) -> CosaContent:
     latents = walk(shape, named, places, mask, code)
     reader.end()
     return CosaContent(
-        shape,
-        frame,
-        steps,
-        origin,
-        depth,
-        coordinates,
-        mask,
-        named,
-        latents,
-        tuple(symbols),
-        tuple(tables),
-        weights,
+        shape=shape,
+        frame=frame,
+        steps=steps,
+        origin=origin,
+        depth=depth,
+        coordinates=coordinates,
+        mask=mask,
+        networks=named,
+        latents=latents,
+        symbols=tuple(symbols),
+        tables=tuple(tables),
+        weights=weights,
     )
 
 

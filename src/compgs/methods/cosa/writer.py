@@ -9,6 +9,7 @@ from torch import nn
 
 from compgs.codec.anchor_order import canonical_order
 from compgs.codec.encoder import ONE, integer_network, quantized_tensor
+from compgs.codec.format import MAX_SYMBOL
 from compgs.codec.integer_network import IntegerLayer, IntegerNetwork
 from compgs.codec.mask_coder import encode_masks
 from compgs.codec.octree import encode_positions
@@ -19,7 +20,7 @@ from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import NotEncodable
 from compgs.formats.packed import Packed, write_packed
-from compgs.methods.cosa.chain import walk
+from compgs.methods.cosa.chain import coordinate_inputs, walk
 from compgs.methods.cosa.content import CosaContent
 from compgs.methods.cosa.entropy import ContextNetwork
 from compgs.methods.cosa.model import CosaModel
@@ -46,29 +47,22 @@ def content_of(model: CosaModel) -> CosaContent:
     y = {g: v.detach().cpu().double().numpy()[rows] / steps[g] for g, v in model.natural().items()}
     y["offset"] = y["offset"].reshape(*mask.shape, 3)[mask]
     coded = _Rounding(y)
-    x, y_, z = (int(v) for v in model.origin)
-    content = CosaContent(
-        model.chain.shape,
-        model.frame,
-        steps,
-        (x, y_, z),
-        int(model.depth),
-        coordinates,
-        mask,
-        networks,
-        {},
-        (),
-        (),
-        {name: quantized_tensor(w, model.weight_bits(w)) for name, w in model.networks.weights().items()},
-    )
-    latents = walk(content.shape, networks, content.places, mask, coded)
+    places = coordinate_inputs(coordinates, model.origin.cpu().numpy(), int(model.depth))
+    latents = walk(model.chain.shape, networks, places, mask, coded)
+    corner_x, corner_y, corner_z = (int(v) for v in model.origin)
     return CosaContent(
-        **{
-            **vars(content),
-            "latents": latents,
-            "symbols": tuple(coded.symbols),
-            "tables": tuple(coded.tables),
-        }
+        shape=model.chain.shape,
+        frame=model.frame,
+        steps=steps,
+        origin=(corner_x, corner_y, corner_z),
+        depth=int(model.depth),
+        coordinates=coordinates,
+        mask=mask,
+        networks=networks,
+        latents=latents,
+        symbols=tuple(coded.symbols),
+        tables=tuple(coded.tables),
+        weights={n: quantized_tensor(w, model.weight_bits(w)) for n, w in model.networks.weights().items()},
     )
 
 
@@ -85,7 +79,13 @@ class _Rounding:
         y = self.y[group]
         if group == "latent":
             y, self.latents = y[:, self.latents : self.latents + 1], self.latents + 1
-        symbols = np.rint(y - means / ONE).astype(np.int32)
+        steps = np.rint(y - means / ONE)
+        if steps.size and np.abs(steps).max() > MAX_SYMBOL:
+            raise NotEncodable(
+                f"a {group.replace('_', ' ')} is {np.abs(steps).max():.3g} steps from what is expected of it, at most "
+                f"{MAX_SYMBOL} can be coded: the training has diverged"
+            )
+        symbols = steps.astype(np.int32)
         self.symbols.append(symbols)
         self.tables.append(tables)
         return symbols

@@ -24,7 +24,7 @@ from compgs.scene.views import Scene
 from compgs.tensors.splats import Splats
 from compgs.training import Hooks, Phase, Run, SplatTrainer, train_phases
 from compgs.training.importance import PRUNED_BY, spread
-from compgs.training.optimizers import replace_parameter
+from compgs.training.optimizers import rates_for, replace_parameter
 from compgs.training.splat_trainer import HOOKS
 
 RAW_BYTES = 36  # of a splat: position, color, scale
@@ -141,7 +141,8 @@ class Latents(Hooks):
         groups = {group["name"]: group for group in trainer.optimizer.param_groups}
         for attribute in self.attributes:
             rate = self.latent_rate(attribute)
-            groups[f"{HOOKS}{attribute.name}_latents"]["rates"] = (rate, rate)
+            rates = rates_for(self.config.training.views_per_step, (rate, rate))
+            groups[f"{HOOKS}{attribute.name}_latents"]["rates"] = rates
 
     def transform(self, splats: Splats, trainer: SplatTrainer) -> Splats:
         return replace(splats, **self.decode())

@@ -10,7 +10,10 @@ Everything is computed in the same order each time: on the same CPU the same vec
 import torch
 from torch import Tensor
 
-MOST_DISTANCES = 1 << 23  # computed at once: 32 MB
+MOST_DISTANCES = 1 << 18  # computed at once: 1 MB, which caches hold
+MOST_WHOLE_STEPS = (
+    40  # of moving averages where each batch is all vectors: they are the same ones again and again
+)
 
 
 @torch.no_grad()
@@ -73,9 +76,10 @@ def averaged_codes(
 ) -> Tensor:  # [K, C]
     """Codes that are moving averages of the (weighted) vectors they were nearest to, batch by batch.
 
-    A code that no vector of a batch is near stays, and so does its weight fade.
+    A code that no vector of a batch is near stays where it is, and its weight fades.
     """
     codes = codes.clone()
+    steps = steps if batch < len(vectors) else min(steps, MOST_WHOLE_STEPS)
     mass = torch.zeros(len(codes), dtype=vectors.dtype, device=vectors.device)
     for step in range(steps):
         if batch < len(vectors):

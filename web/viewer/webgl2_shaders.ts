@@ -1,7 +1,6 @@
 /** Splats as docs/bitstream_prediction.md, "Rendering", has them: one quad each, drawn from back to front. */
 
-/** Primitives in a row of the textures. */
-export const ROW = 2048;
+import { CUTOFF, DILATION, MARGIN, MOST_ALPHA, NEAR, ROW } from "./splatting.ts";
 
 export const SPLAT_VERTEX = `#version 300 es
 precision highp float;
@@ -18,9 +17,6 @@ uniform vec2 size;             // pixels
 layout(location = 0) in uint primitive;
 out vec2 place;                // standard deviations from the middle
 out vec4 color;
-const float NEAR = 0.01;       // world units
-const float DILATION = 0.3;    // pixels^2
-const float CUTOFF = 1.0 / 255.0;
 
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside, unless it is drawn
@@ -28,25 +24,25 @@ void main() {
   ivec2 at = ivec2(index % ${ROW}, index / ${ROW});
   color = texelFetch(appearance, at, 0);
   vec3 p = rotation * texelFetch(geometry, at, 0).xyz + translation;
-  if (p.z < NEAR || !(color.a > CUTOFF)) return;
+  if (p.z < ${NEAR} || !(color.a > ${CUTOFF})) return;
   vec3 s0 = texelFetch(geometry, at + ivec2(0, planeRows), 0).xyz;
   vec3 s1 = texelFetch(geometry, at + ivec2(0, 2 * planeRows), 0).xyz;
   mat3 covariance = mat3(s0.x, s0.y, s0.z, s0.y, s1.x, s1.y, s0.z, s1.y, s1.z);
-  vec2 widened = 0.15 * size / focal;
+  vec2 widened = ${MARGIN} * size / focal;
   vec2 ratio = clamp(p.xy / p.z, -principal / focal - widened, (size - principal) / focal + widened);
   vec3 row0 = vec3(focal.x / p.z, 0.0, -focal.x * ratio.x / p.z) * rotation;
   vec3 row1 = vec3(0.0, focal.y / p.z, -focal.y * ratio.y / p.z) * rotation;
   vec3 c0 = covariance * row0;
-  float a = dot(row0, c0) + DILATION;
+  float a = dot(row0, c0) + ${DILATION};
   float b = dot(row1, c0);
-  float c = dot(row1, covariance * row1) + DILATION;
+  float c = dot(row1, covariance * row1) + ${DILATION};
   // Principal axes of the ellipse.
   float radius = length(vec2(0.5 * (a - c), b));
   float largest = 0.5 * (a + c) + radius;
   float smallest = max((a * c - b * b) / largest, 1e-6);
   vec2 axis = a >= c ? vec2(largest - c, b) : vec2(b, largest - a);
   axis = radius > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
-  float reach = sqrt(2.0 * log(255.0 * color.a)) + 1e-3;  // where alpha falls below 1/255
+  float reach = sqrt(2.0 * log(color.a / ${CUTOFF})) + 1e-3;  // where alpha falls below the cutoff
   vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
   place = corner * reach;
   vec2 pixel = focal * p.xy / p.z + principal
@@ -61,8 +57,8 @@ in vec2 place;
 in vec4 color;
 out vec4 result;
 void main() {
-  float alpha = min(0.999, color.a * exp(-0.5 * dot(place, place)));
-  if (alpha < 1.0 / 255.0) discard;
+  float alpha = min(${MOST_ALPHA}, color.a * exp(-0.5 * dot(place, place)));
+  if (alpha < ${CUTOFF}) discard;
   result = vec4(color.rgb * alpha, alpha);
 }`;
 
