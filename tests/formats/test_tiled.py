@@ -20,7 +20,7 @@ from compgs.evaluation.camera_path import look_at, orbit
 from compgs.formats import check_scene, component_bytes, format_of, open_scene, open_tiles
 from compgs.formats.tiled import Core, GroundAxes, read_manifest
 from compgs.formats.tiled_scene import ASKED_BY, TileCache, TiledScene, resident_bytes, tile_memory
-from compgs.formats.tiled_writer import NewTile, common_offset, spheres, write_tiles
+from compgs.formats.tiled_writer import NewTile, _counted_from, common_offset, spheres, write_tiles
 from compgs.gaussians import Gaussians
 from compgs.render import RasterSettings, Renderable, rasterize, render
 
@@ -130,7 +130,7 @@ def test_a_picture_with_more_tiles_than_fit_finds_most_of_them_open_the_next_tim
 def test_a_tile_that_takes_more_than_was_said_still_makes_room(folder: Path) -> None:
     model = open_tiles(folder / "manifest.json")
     tile = model.manifest.tiles[0].memory
-    cache = TileCache(model.cache.get, [1] * 4, 2 * tile)
+    cache = TileCache(model.cache.get, [1] * 4, 2 * tile + tile // 2)
     for index in (0, 1, 2):
         cache.get(index)
     assert cache.bytes == 2 * tile and [index in cache for index in range(4)] == [False, True, True, False]
@@ -178,6 +178,19 @@ def test_spheres_of_a_manifest_hold_the_anchors_far_from_the_origin_too(
         reach = np.linalg.norm(positions[:, None] - centers, axis=2) + tile.bounds[1][:, None]
         assert (reach <= radii).any(1).all()
     assert radii.max() < 50
+
+
+def test_spheres_lose_nothing_by_the_digits_that_a_manifest_has(folder: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    exact = np.concatenate([rng.normal(size=(500, 3)) * 900, rng.exponential(size=(500, 1))], axis=1)
+    whole = read_manifest(folder / "manifest.json")
+    tile = replace(whole.tiles[0], spheres=exact)
+    counted = _counted_from((-1000.0, 300.0, 0.0), tile)
+    (tmp_path / "manifest.json").write_bytes(replace(whole, tiles=(counted,)).encoded())
+    read = read_manifest(tmp_path / "manifest.json").tiles[0].spheres.astype(np.float32).astype(np.float64)
+    moved = exact[:, :3] + [1000.0, -300.0, 0.0]
+    assert (np.linalg.norm(read[:, :3] - moved, axis=1) + exact[:, 3] <= read[:, 3]).all()
+    assert (read[:, 3] < exact[:, 3] + 0.2).all()
 
 
 def test_what_a_tile_is_said_to_take_is_what_its_arrays_take(folder: Path) -> None:
