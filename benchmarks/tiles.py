@@ -43,8 +43,9 @@ from compgs.render import RasterSettings, local_camera, rasterize, render, visib
 from compgs.scene import load_scene
 from compgs.tiles import Plan, read_plan
 from compgs.tiles.ground import ground_of
+from compgs.tiles.plan import contains
 
-NEAR = 0.05  # of the scene's length across a border, to both sides
+NEAR = 0.1  # of the narrowest core's side across a border, to both sides of it
 CORE_SHARE = 0.7  # of the anchors, those nearest to the middle on the ground, that become a tile of the city
 SIZE = 480, 360  # pixels
 
@@ -88,7 +89,9 @@ def near_border(model: Any, camera: Camera, plan: Plan, points: np.ndarray) -> n
     local = local_camera(model, camera)
     gaussians = model.gaussians(local)
     places = plan.ground.places(gaussians.means + np.array(model.world_offset))
-    lengths = np.ptp(np.quantile(plan.ground.places(points), [0.02, 0.98], axis=0), axis=0)
+    on_ground = plan.ground.places(points)
+    inner = [np.quantile(on_ground[contains(t.core, on_ground)], [0.02, 0.98], axis=0) for t in plan.tiles]
+    lengths = np.min([np.ptp(corners, axis=0) for corners in inner], axis=0)
     near = np.zeros(len(places), bool)
     for tile in plan.tiles:
         for axis in (0, 1):

@@ -14,6 +14,7 @@ from compgs.evaluation.camera_path import look_at
 from compgs.formats.tiled import Core
 from compgs.scene.sight import depths_in
 from compgs.scene.views import Points, Scene, View
+from compgs.tiles import block as block_module
 from compgs.tiles import block_scene, grid_for, parse_grid, plan_tiles, read_plan, write_plan
 from compgs.tiles.ground import ground_of
 from compgs.tiles.plan import contains, cuts
@@ -99,6 +100,16 @@ def test_tiles_are_padded_by_a_fifth_of_what_their_points_cover(street: Scene) -
     assert left.padded.low == left.core.low == (-math.inf, -math.inf)
 
 
+def test_the_spacing_of_a_tile_is_that_of_its_own_points() -> None:
+    """A grid of steps of 0.5 on one side, of 2 on the other."""
+    fine = np.stack(np.meshgrid(np.arange(-40, -10, 0.5), np.arange(0, 10, 0.5), [0.0]), -1).reshape(-1, 3)
+    coarse = np.stack(np.meshgrid(np.arange(10, 140, 2.0), np.arange(0, 10, 2.0), [0.0]), -1).reshape(-1, 3)
+    camera = camera_at((20, 200, 50), (20, 0, 0))
+    plan = plan_tiles(scene_of(np.concatenate([fine, coarse]), {"a": camera, "b": camera}), 4, 1)
+    spacings = sorted(round(tile.spacing, 6) for tile in plan.tiles)
+    assert spacings[0] == 0.5 and spacings[-1] == 2.0
+
+
 def test_margins_reach_no_farther_than_a_fifth_of_the_points() -> None:
     """Most of the points in a small heap, some far away, which say how long the sides of the outer tiles are."""
     rng = np.random.default_rng(6)
@@ -166,7 +177,15 @@ def test_a_margin_lets_in_what_is_beside_the_image() -> None:
     assert depths_in(camera, beside, 0.1)[1].all()
 
 
-def test_a_block_has_its_points_and_of_what_its_views_see_at_most_as_many(street: Scene) -> None:
+def test_a_block_has_its_points_and_of_what_its_views_see_at_most_as_many(
+    street: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = plan_tiles(street, 6, 1)
+    block = block_scene(street, whole.ground, whole.tiles[0])
+    seen = times_seen([view.camera for view in block.train_views], street.points.positions) > 0
+    inside = contains(whole.tiles[0].padded, whole.ground.places(street.points.positions))
+    assert len(block.points) == (seen | inside).sum()  # few enough that nothing is left out
+    monkeypatch.setattr(block_module, "KEPT_OUTSIDE", 0)
     plan = plan_tiles(street, 2, 1)
     for tile in plan.tiles:
         block = block_scene(street, plan.ground, tile)

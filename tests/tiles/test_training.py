@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import compgs
 from compgs import extras
 from compgs.cli import train as train_command
 from compgs.cli.main import main
@@ -88,6 +89,13 @@ def test_a_run_in_tiles_leaves_tiles_and_an_evaluation_of_all_together(city: Pat
     training = json.loads((city / "training.json").read_text())
     assert training["steps"] == 2 * STEPS and set(training["tiles"]) == {"0_0", "1_0"}
     assert not (city / "blocks" / "0_0" / "results.json").exists()
+
+
+def test_anchors_of_a_tile_are_as_dense_as_its_own_points(city: Path) -> None:
+    spacings = compgs.load_config("quick").model.voxel_spacings
+    for tile in read_plan(city / "plan.json").tiles:
+        model = open_scene(city / "city.tiles" / f"{tile.name}.cgs")
+        assert model.primitives.voxel_size == pytest.approx(spacings * tile.spacing, rel=1e-12)
 
 
 def test_every_anchor_lies_in_the_core_of_its_tile_and_no_place_is_twice(city: Path) -> None:

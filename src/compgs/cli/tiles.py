@@ -25,6 +25,7 @@ from compgs.outputs import write_json
 
 if TYPE_CHECKING:
     from compgs.cli.train import Train
+    from compgs.config import Config
     from compgs.scene import Scene
     from compgs.tiles import Plan, TileJob
 
@@ -91,7 +92,15 @@ def settings_of_tile(place: str) -> RunSettings:
         tile = plan.tile(name)
     settings = load_settings(Path(path).parent)
     entry = {"ground": ground_entry(plan.ground), **tile.to_dict()}
-    return replace(settings, tiles=None, tile=entry)
+    return replace(settings, tiles=None, tile=entry, config=_with_voxels(settings.config, tile.spacing))
+
+
+def _with_voxels(config: "Config", spacing: float) -> "Config":
+    """Voxels as the tile's own points ask for: those outside are perhaps thinned out, and would ask for larger ones."""
+    m = config.model
+    return (
+        config if m.voxel_size else replace(config, model=replace(m, voxel_size=m.voxel_spacings * spacing))
+    )
 
 
 def block(scene: "Scene", settings: RunSettings) -> "Scene":

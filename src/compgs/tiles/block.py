@@ -11,9 +11,13 @@ from compgs.tiles.ground import Ground
 from compgs.tiles.plan import Tile, contains
 from compgs.tiles.sight import times_seen
 
+# Points outside of a tile that are kept in any case: a training holds so many, and what is thinned out is worse.
+KEPT_OUTSIDE = 100_000
+
 
 def block_scene(scene: Scene, ground: Ground, tile: Tile) -> Scene:
-    """The views of a tile, the points of its padded core, and of what else these views see at most as many.
+    """The views of a tile, the points of its padded core, and of what else these views see at most as many, or
+    KEPT_OUTSIDE.
 
     What lies outside is in the pictures, too: without anything to show it, the tile would grow fog before its own
     cameras. It is trained along, and cut off in the end. The held-out views stay those of the whole scene. Raises
@@ -39,7 +43,7 @@ def block_scene(scene: Scene, ground: Ground, tile: Tile) -> Scene:
 def _points(points: Points, cameras: list, ground: Ground, tile: Tile) -> Points:
     inside = contains(tile.padded, ground.places(points.positions))
     around = np.flatnonzero(~inside & (times_seen(cameras, points.positions) > 0))
-    most = int(inside.sum())
+    most = max(int(inside.sum()), KEPT_OUTSIDE)
     if len(around) > most:
         around = np.random.default_rng(0).choice(around, most, replace=False)
     kept = inside.copy()

@@ -22,7 +22,7 @@ from compgs.cameras import Camera
 from compgs.errors import CheckpointError, ConfigError
 from compgs.formats.tiled import Core, core_entry, core_from_entry
 from compgs.outputs import write_json
-from compgs.scene.points import MIN_POINTS
+from compgs.scene.points import MIN_POINTS, median_spacing
 from compgs.scene.views import Scene
 from compgs.tiles.ground import Ground, ground_of
 from compgs.tiles.sight import shares_of_picture, times_seen
@@ -50,6 +50,7 @@ class Tile:
     core: Core
     padded: Core
     points: int  # in the core
+    spacing: float  # world units: the median distance of the padded core's points to their nearest neighbours
     views: tuple[str, ...]  # names of training views
 
     def to_dict(self) -> dict[str, Any]:
@@ -59,6 +60,7 @@ class Tile:
             "core": core_entry(self.core),
             "padded": core_entry(self.padded),
             "points": self.points,
+            "spacing": self.spacing,
             "views": list(self.views),
         }
 
@@ -66,7 +68,10 @@ class Tile:
     def from_dict(cls, entry: dict[str, Any]) -> "Tile":
         """Inverse of `to_dict`. Raises ValueError, KeyError, TypeError."""
         core, padded = (core_from_entry(entry[name]) for name in ("core", "padded"))
-        return cls(str(entry["name"]), core, padded, int(entry["points"]), tuple(map(str, entry["views"])))
+        points, spacing, views = int(entry["points"]), float(entry["spacing"]), entry["views"]
+        if not 0 < spacing < math.inf:
+            raise ValueError(f"a spacing of {spacing}")
+        return cls(str(entry["name"]), core, padded, points, spacing, tuple(map(str, views)))
 
 
 @dataclass(frozen=True)
@@ -159,7 +164,15 @@ def plan_tiles(scene: Scene, columns: int, rows: int) -> Plan:
     padded = {name: _padded(core, places, inside[name]) for name, core in cores.items()}
     views = _views_of(scene, cameras, sample, ground, cores, padded)
     tiles = tuple(
-        Tile(name, core, padded[name], int(inside[name].sum()), views[name]) for name, core in cores.items()
+        Tile(
+            name=name,
+            core=core,
+            padded=padded[name],
+            points=int(inside[name].sum()),
+            spacing=median_spacing(positions[contains(padded[name], places)]),
+            views=views[name],
+        )
+        for name, core in cores.items()
     )
     for tile in tiles:
         if not tile.views:
