@@ -15,6 +15,7 @@ SOURCE = Path(compgs.__file__).parent
 # A part may import itself, and the parts named here.
 BASE = {
     "compgs", "numerics", "errors", "extras", "gaussians", "cameras", "config", "interrupt", "outputs", "presets",
+    "words",
 }  # fmt: skip
 ALLOWED = {
     "compgs": {
@@ -38,6 +39,7 @@ ALLOWED = {
     "devices": {"errors", "extras", "tensors"},
     "interrupt": set(),
     "outputs": {"errors"},
+    "words": set(),
     "gaussians": set(),
     "cameras": set(),
     "config": {"errors", "presets"},

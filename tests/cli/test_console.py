@@ -8,22 +8,6 @@ from compgs.cli import console, progress
 from compgs.codec.reader import RangeInfo
 
 
-@pytest.mark.parametrize(
-    ("count", "text"),
-    [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (258_143, "258.1 kB"), (1_240_000, "1.24 MB")],
-)
-def test_sizes_are_in_powers_of_1000(count: int, text: str) -> None:
-    assert console.size(count) == text
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.0053, "5.3 ms"), (1.25, "1.25 s"), (245, "4 min 05 s"), (3599.9, "1 h 00 min"), (7380, "2 h 03 min")],
-)
-def test_times_have_a_readable_unit(seconds: float, text: str) -> None:
-    assert console.duration(seconds) == text
-
-
 def test_components_are_shown_with_their_sum(capsys: pytest.CaptureFixture[str]) -> None:
     console.print_components({"positions": 300, "reference embeddings": 700}, anchors=100, coupled=800)
     lines = capsys.readouterr().out.splitlines()

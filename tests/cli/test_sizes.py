@@ -2,9 +2,9 @@
 
 import pytest
 
-from compgs.cli.console import size
 from compgs.cli.sizes import parse_size
 from compgs.cli.usage import UsageError
+from compgs.words import size
 
 
 @pytest.mark.parametrize(

@@ -199,6 +199,41 @@ def test_an_anchors_own_bits_go_with_its_last_primitive(blob_scene: Scene) -> No
     assert masks.grad[2].tolist() == pytest.approx([2 + each / k] * k, rel=1e-3)
 
 
+def test_a_position_costs_what_the_settings_say(blob_scene: Scene) -> None:
+    totals = []
+    for position_bits in (0.0, 12.5):
+        model = CosaTrainer(blob_scene, settings(position_bits=position_bits), CPU, "cosa-gs").model
+        bits = {group: torch.ones(model.anchors) for group in GROUPS}
+        masks = torch.ones(model.anchors, 4)
+        masks[:10] = 0  # these have none
+        totals.append(model.total_bits({**bits, "offset": torch.ones(model.anchors, 4)}, masks).item())
+    assert totals[1] - totals[0] == pytest.approx(12.5 * (model.anchors - 10), rel=1e-3)
+
+
+def test_late_in_a_run_the_networks_compute_with_the_weights_of_the_file(blob_scene: Scene) -> None:
+    trainer = CosaTrainer(blob_scene, settings(), CPU, "cosa-gs")
+    for step, rounded in ((71, False), (72, True)):  # 80 % of 90
+        trainer.step = step
+        weight = (
+            trainer.weights()["color_weight1"].detach() * 2**7
+        )  # below 1/2: seven bits are so many whole numbers
+        assert torch.equal(weight, weight.round()) == rounded
+        assert 16 < weight.abs().max() < 64
+
+
+def test_anchors_without_primitives_go_during_the_second_phase(blob_scene: Scene) -> None:
+    trainer = CosaTrainer(blob_scene, settings(), CPU, "cosa-gs")
+    trainer.step = trainer.rate_at
+    trainer.train_step()
+    before = trainer.model.anchors
+    with torch.no_grad():
+        trainer.model.mask_logits[:5] = -20.0
+    while (trainer.step - trainer.rate_at) % trainer.schedule.every:
+        assert trainer.model.anchors == before
+        trainer.train_step()
+    assert trainer.model.anchors <= before - 5
+
+
 def _entropy(p: float) -> float:
     return -(p * np.log2(p) + (1 - p) * np.log2(1 - p))
 

@@ -10,11 +10,12 @@ from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from compgs.cli.command import NO_DEFAULT, ComputingCommand
-from compgs.cli.console import console, duration, say, size
+from compgs.cli.console import console, say
 from compgs.cli.progress import counting, training
 from compgs.cli.settings import with_settings
 from compgs.cli.sizes import parse_size, parse_time
 from compgs.cli.usage import UsageError, settings_of_options
+from compgs.words import duration, size
 
 if TYPE_CHECKING:
     from compgs.compressing import Compressed, Compression, Looking

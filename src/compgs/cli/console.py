@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from compgs.cli.usage import in_words_of_options
+from compgs.words import duration, size
 
 if TYPE_CHECKING:
     from compgs.codec.reader import RangeInfo
@@ -37,27 +38,6 @@ def say(message: str) -> None:
 def warn(message: str) -> None:
     """One line about what is probably not as somebody meant it, markup taken literally."""
     errors.print(f"[bold yellow]warning:[/] {escape(message)}")
-
-
-def size(count: float) -> str:
-    """Bytes as people write them: `812 B`, `258.1 kB`, `1.24 MB` (powers of 1000)."""
-    if count < 1000:
-        return f"{count:.0f} B"
-    if count < 1e6:
-        return f"{count / 1e3:.1f} kB"
-    return f"{count / 1e6:.2f} MB" if count < 1e9 else f"{count / 1e9:.2f} GB"
-
-
-def duration(seconds: float) -> str:
-    """`5.3 ms`, `1.25 s`, `4 min 05 s`."""
-    if seconds < 1:
-        return f"{seconds * 1e3:.1f} ms"
-    if seconds < 60:
-        return f"{seconds:.2f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
 def print_components(components: Mapping[str, int], anchors: int, coupled: int) -> None:

@@ -8,12 +8,13 @@ from typing import Annotated, Any
 from tyro.conf import FlagCreatePairsOff, arg
 
 from compgs.cli.command import NO_DEFAULT, DecodingCommand, FileArgument
-from compgs.cli.console import duration, say, size
+from compgs.cli.console import say
 from compgs.cli.inputs import check_bitstream, tiles_manifest
 from compgs.cli.prefixes import parse_prefix
 from compgs.cli.usage import UsageError
 from compgs.numerics.compiling import working_seconds
 from compgs.outputs import check_output_folder, write_bytes
+from compgs.words import duration, size
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.command import DecodingCommand, ReadingOptions, allow_tmc3
-from compgs.cli.console import duration, print_components, print_reduction, say, size
+from compgs.cli.console import print_components, print_reduction, say
 from compgs.cli.inputs import check_bitstream, read_bitstream
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import CHECKPOINT_NAME, SETTINGS_NAME, SceneSource, file_name, load_settings
@@ -18,6 +18,7 @@ from compgs.cli.tiles import cut
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.errors import CheckpointError
 from compgs.outputs import check_output_file, write_bytes
+from compgs.words import duration, size
 
 if TYPE_CHECKING:
     from compgs.cameras import Camera

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileArgument
-from compgs.cli.console import say, size
+from compgs.cli.console import say
 from compgs.cli.progress import counting
 from compgs.cli.sizes import parse_size
 from compgs.cli.usage import check_range, settings_of_options
+from compgs.words import size
 
 if TYPE_CHECKING:
     from compgs.exporting import Exported

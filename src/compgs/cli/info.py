@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from compgs.cli.command import Command, FileArgument
-from compgs.cli.console import console, print_components, print_ranges, print_tiles, say, size
+from compgs.cli.console import console, print_components, print_ranges, print_tiles, say
 from compgs.cli.inputs import read_bitstream, tiles_manifest
+from compgs.words import size
 
 
 @dataclass(frozen=True, kw_only=True)

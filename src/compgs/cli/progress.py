@@ -14,7 +14,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from compgs.cli.console import console, duration, say, size
+from compgs.cli.console import console, say
+from compgs.words import duration, size
 
 if TYPE_CHECKING:
     from compgs.training import TrainingStatus

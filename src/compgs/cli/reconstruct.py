@@ -10,9 +10,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.command import NO_DEFAULT, Command
-from compgs.cli.console import console, duration, say
+from compgs.cli.console import console, say
 from compgs.cli.progress import LINE_SECONDS, counting_lines
 from compgs.cli.usage import check_range, settings_of_options
+from compgs.words import duration
 
 if TYPE_CHECKING:
     from compgs.reconstruct import Reconstruction

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, arg
 
 from compgs.cli.command import NO_DEFAULT, DecodingCommand, MemoryOption, SceneFileOrRunArgument, SceneOptions
-from compgs.cli.console import duration, say
+from compgs.cli.console import say
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import RunSettings, SceneSource, file_and_run
 from compgs.cli.scenes import read_scene
 from compgs.cli.usage import UsageError, check_range
 from compgs.errors import OutputError
 from compgs.outputs import check_output_file, check_output_folder, write_bytes, write_json
+from compgs.words import duration
 
 if TYPE_CHECKING:
     import numpy as np

@@ -7,9 +7,10 @@ from typing import Annotated
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.command import Command
-from compgs.cli.console import say, size
+from compgs.cli.console import say
 from compgs.cli.progress import counting
 from compgs.cli.usage import UsageError, check_range, settings_of_options
+from compgs.words import size
 
 
 @dataclass(frozen=True, kw_only=True)

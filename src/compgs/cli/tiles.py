@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from compgs.cli.command import ReadingOptions, check_lpips
-from compgs.cli.console import say, size
+from compgs.cli.console import say
 from compgs.cli.progress import counting_runs
 from compgs.cli.ranks import several
 from compgs.cli.run_folder import (
@@ -22,6 +22,7 @@ from compgs.cli.usage import UsageError, settings_of_options
 from compgs.errors import CheckpointError, ConfigError
 from compgs.extras import require
 from compgs.outputs import write_json
+from compgs.words import size
 
 if TYPE_CHECKING:
     from compgs.cli.train import Train

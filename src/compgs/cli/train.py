@@ -19,7 +19,7 @@ from compgs.cli.command import (
     one_scene,
     use_threads,
 )
-from compgs.cli.console import duration, print_profile, print_results, say, size
+from compgs.cli.console import print_profile, print_results, say
 from compgs.cli.offer import with_poses
 from compgs.cli.progress import counting, training
 from compgs.cli.ranks import among_ranks, several, share_of_threads
@@ -43,6 +43,7 @@ from compgs.errors import MissingSparseModel
 from compgs.extras import require
 from compgs.methods import METHODS, Method, settings_of, train
 from compgs.outputs import check_output_folder, write_json
+from compgs.words import duration, size
 
 if TYPE_CHECKING:
     from compgs.cli.viewing import Viewing

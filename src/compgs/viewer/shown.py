@@ -11,6 +11,7 @@ from compgs.cameras import Camera
 from compgs.evaluation.camera_path import orbit
 from compgs.formats import component_bytes, format_of, open_scene, scene_file, scene_name
 from compgs.render import Renderable
+from compgs.words import size
 
 if TYPE_CHECKING:
     pass
@@ -71,7 +72,7 @@ class FileShown:
         self.up: Vector = getattr(self.whole, "up", USUAL_UP)
         self.title = scene_name(path)
         self._prefixes = _prefixes(path)
-        everything = f"all of it: {_in_words(sum(component_bytes(path).values()))}"
+        everything = f"all of it: {size(sum(component_bytes(path).values()))}"
         self.levels = (*(words for _, words in self._prefixes), everything)
         cameras = self.whole.viewpoints
         self.cameras = tuple((f"camera {i}", camera) for i, camera in enumerate(cameras)) or (
@@ -135,11 +136,7 @@ def _prefixes(path: Path) -> list[tuple[int, str]]:
     from compgs.codec.reader import file_info
 
     ranges = file_info(path.read_bytes()).ranges
-    return [(part.bytes, f"{_in_words(part.bytes)}: {part.anchors:,} anchors") for part in ranges[:-1]]
-
-
-def _in_words(count: int) -> str:
-    return f"{count / 1e6:.2f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
+    return [(part.bytes, f"{size(part.bytes)}: {part.anchors:,} anchors") for part in ranges[:-1]]
 
 
 def _beside(model: Renderable) -> Camera:

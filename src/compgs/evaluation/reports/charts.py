@@ -71,15 +71,6 @@ def line_chart(series: Sequence[Series], x: Axis, y: Axis) -> str:
     return _svg(parts, WIDTH, HEIGHT, f"{y.label} over {x.label}")
 
 
-def size(count: float) -> str:
-    """Bytes with three digits: `900 B`, `20 kB`, `1.54 MB` (powers of 1000)."""
-    for factor, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
-        # What would be rounded to 1000 kB is 1 MB.
-        if count >= 0.9995 * factor:
-            return f"{float(f'{count / factor:.3g}'):g} {unit}"
-    return f"{count:.0f} B"
-
-
 def legend(series: Sequence[Series], *, squares: bool = False) -> str:
     """What the colors and markers mean; those of bars are squares."""
     items = []

@@ -11,6 +11,7 @@ from compgs.evaluation.reports.runs import Run, read_runs
 from compgs.evaluation.reports.summary import Point
 from compgs.evaluation.reports.tables import Table
 from compgs.outputs import check_output_file, write_bytes
+from compgs.words import short_size
 
 SHOWN_CURVES = 12  # of trainings in one chart
 SHOWN_COMPONENTS = 9  # each with a color; the others are one
@@ -131,7 +132,7 @@ def _overview(points: Sequence[Point], made: Sequence[Table]) -> list[str]:
 
 def _curves(scene: str, points: Sequence[Point], methods: Sequence[str]) -> list[str]:
     """Two charts, by PSNR and by SSIM; a method has one color in all scenes."""
-    bytes_axis = charts.Axis("size of the file", log=True, form=charts.size)
+    bytes_axis = charts.Axis("size of the file", log=True, form=short_size)
     panels = []
     series: list[charts.Series] = []
     for measure, name, form in summary.MEASURES:
@@ -151,7 +152,7 @@ def _curves(scene: str, points: Sequence[Point], methods: Sequence[str]) -> list
 def _chart_point(point: Point, measure: str, form: str) -> charts.Point:
     size, quality = point.spread("bytes"), point.spread(measure)
     assert size is not None and quality is not None
-    told = f"{point.rate} {charts.size(size.mean)}, {tables.shown(quality, form)}"
+    told = f"{point.rate} {short_size(size.mean)}, {tables.shown(quality, form)}"
     return charts.Point(size.mean, quality.mean, size.deviation, quality.deviation, told.strip())
 
 
@@ -171,7 +172,7 @@ def _components(scene: str, points: Sequence[Point], names: Sequence[str]) -> li
         parts = summary.components(point)
         others = sum(count for name, count in parts.items() if name not in names)
         values = [*(parts.get(name, 0) for name in names), others]
-        rows.append((f"{point.method} {point.rate}".strip(), values, charts.size(sum(values))))
+        rows.append((f"{point.method} {point.rate}".strip(), values, short_size(sum(values))))
     shown = [*names, OTHER]
     present = [charts.Series(name, (), i) for i, name in enumerate(shown) if any(row[1][i] for row in rows)]
     return [page.heading(scene, 3), charts.shares_chart(rows, shown), charts.legend(present, squares=True)]
@@ -201,7 +202,7 @@ def _training(points: Sequence[Point]) -> list[str]:
             charts.line_chart(
                 series["estimated_bytes"],
                 steps,
-                charts.Axis("size, as estimated while training", log=True, form=charts.size),
+                charts.Axis("size, as estimated while training", log=True, form=short_size),
             ),
         ]
         parts += [page.heading(scene, 3), page.side_by_side(panels), charts.legend(series["psnr"])]
