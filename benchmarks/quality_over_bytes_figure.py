@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from ablation_figures import png
 
+from compgs.words import short_size
+
 if TYPE_CHECKING:
     from quality_over_bytes import Point
 
@@ -92,7 +94,7 @@ def name_beside(axes: Any, points: Sequence["Point"], measure: str, name: str, c
     smallest = min(points, key=lambda point: point.bytes)
     alone = len(points) == 1
     axes.annotate(
-        f"{name}\n{plain_bytes(smallest.bytes)}" if alone else name,
+        f"{name}\n{short_size(smallest.bytes)}" if alone else name,
         (smallest.bytes, getattr(smallest, measure)),
         (0, -6) if alone else (7, -1),
         textcoords="offset points",
@@ -112,14 +114,5 @@ def label_sizes(axes: Any) -> None:
     decades = math.log10(high / low)
     between = (1.0, 2.0, 5.0) if decades < 1.6 else (1.0, 3.0) if decades < 2.5 else (1.0,)
     axes.xaxis.set_major_locator(ticker.LogLocator(subs=between, numticks=20))
-    axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda size, _: plain_bytes(size)))
+    axes.xaxis.set_major_formatter(ticker.FuncFormatter(lambda size, _: short_size(size)))
     axes.xaxis.set_minor_locator(ticker.NullLocator())
-
-
-def plain_bytes(size: float) -> str:
-    """900 B, 20 kB, 1.54 MB: 10^3 and 10^6 bytes, three digits of them."""
-    for factor, unit in ((1e6, "MB"), (1e3, "kB")):
-        # What would be rounded to 1000 kB is 1 MB.
-        if size >= 0.9995 * factor:
-            return f"{float(f'{size / factor:.3g}'):g} {unit}"
-    return f"{size:.0f} B"

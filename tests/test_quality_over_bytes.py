@@ -10,7 +10,7 @@ import pytest
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 from quality_over_bytes import check_comparable, drawn, main, points_of, read_records
-from quality_over_bytes_figure import plain_bytes, styles
+from quality_over_bytes_figure import styles
 
 
 def record(variant: str, curve: str, size: int, psnr: float = 28.0, seed: int = 0, **more: Any) -> dict:
@@ -114,12 +114,6 @@ def test_a_preset_looks_the_same_in_every_chart() -> None:
     assert whole["default"] == half["default"] != whole["paper"]
     assert whole["3DGS"] == half["3DGS"]
     assert styles(points_of([record("x", "other", 1), *CURVES]))["default"] == whole["default"]
-
-
-def test_sizes_are_in_plain_units() -> None:
-    sizes = [900, 999.4, 1000, 20_000, 338_178, 999_400, 999_600, 12_803_042, 1_234_000_000]
-    texts = ["900 B", "999 B", "1 kB", "20 kB", "338 kB", "999 kB", "1 MB", "12.8 MB", "1230 MB"]
-    assert [plain_bytes(size) for size in sizes] == texts
 
 
 def test_chart_table_and_numbers_are_written(tmp_path: Path) -> None:

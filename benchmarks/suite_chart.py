@@ -1,0 +1,100 @@
+"""Quality over bytes of all methods of a suite, from the tables that `compgs benchmark` wrote.
+
+    python benchmarks/suite_chart.py out/table.csv -o docs/results/methods_plush.png
+
+PSNR on the left, SSIM on the right, over the logarithm of the bytes. Methods at several rates are lines; of this
+project's, which are what the eye is to go to, the lines are thick.
+"""
+
+import argparse
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ablation_figures import check_matplotlib
+from quality_over_bytes_figure import DPI, label_sizes
+
+from compgs.outputs import write_bytes
+
+SIZE = (10.0, 4.6)  # inches
+OURS = "compgs"  # what the names of this project's rows begin with
+# Apart in hue for those next to each other in a table, in lightness, too.
+COLORS = (
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#56B4E9",
+    "#8C6D1F",
+    "#7B3294",
+    "#C51B7D",
+    "#4D9221",
+    "#2166AC",
+    "#B2182B",
+)
+MARKERS = ("s", "^", "D", "v", "P", "X", "<", ">", "h", "d")
+
+Row = dict[str, str]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("table", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--title", default="")
+    options = parser.parse_args()
+    check_matplotlib()
+    with options.table.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if not row["method"].endswith("(published)")]
+    write_bytes(options.output, figure(rows, options.title))
+
+
+def figure(rows: Sequence[Row], title: str) -> bytes:
+    """PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    canvas, panels = pyplot.subplots(1, 2, figsize=SIZE)
+    for panel, measure, label in ((panels[0], "psnr", "PSNR, dB"), (panels[1], "ssim", "SSIM")):
+        draw(panel, rows, measure, label)
+    lines, names = panels[0].get_legend_handles_labels()
+    canvas.suptitle(title, fontsize=11)
+    canvas.set_layout_engine("tight", rect=(0, 0, 0.8, 1))  # the names stand beside the panels
+    canvas.legend(lines, names, loc="center right", fontsize=9, frameon=False)
+    buffer = io.BytesIO()
+    canvas.savefig(buffer, format="png", dpi=DPI)
+    pyplot.close(canvas)
+    return buffer.getvalue()
+
+
+def draw(axes: Any, rows: Sequence[Row], measure: str, label: str) -> None:
+    names = list(dict.fromkeys(row["method"] for row in rows))
+    others = [name for name in names if not name.startswith(OURS)]
+    for name in names:
+        points = sorted((float(row["bytes"]), float(row[measure])) for row in rows if row["method"] == name)
+        ours = name.startswith(OURS)
+        place = names.index(name) if ours else others.index(name)
+        axes.plot(
+            *zip(*points, strict=True),
+            label=name,
+            color=("#0072B2", "#000000")[place % 2] if ours else COLORS[place % len(COLORS)],
+            marker="o" if ours else MARKERS[place % len(MARKERS)],
+            linewidth=2.4 if ours else 1.1,
+            markersize=5,
+        )
+    axes.set_xscale("log")
+    label_sizes(axes)
+    axes.set_xlabel("size of the file", fontsize=10)
+    axes.set_ylabel(label, fontsize=10)
+    axes.tick_params(labelsize=9)
+    axes.grid(alpha=0.25, linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+if __name__ == "__main__":
+    main()
