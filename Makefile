@@ -44,7 +44,7 @@ demo: venv
 	@$(BIN)/compgs export demo.cgs demo.html --overwrite
 
 test: venv
-	@$(BIN)/python -m pytest --durations=5
+	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile --durations=5
 
 lint: venv
 	@$(BIN)/ruff check

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 
 from compgs.cameras import Camera
 from compgs.codec.encoder import to_content
@@ -28,6 +29,9 @@ def pytest_configure() -> None:
 
 
 UP = np.array([0.0, 0.0, 1.0])
+# Tests measure no time: several run at once, and the first of them compiles.
+settings.register_profile("without a deadline", deadline=None)
+settings.load_profile("without a deadline")
 
 
 @pytest.fixture
