@@ -3,8 +3,9 @@
     python benchmarks/view_training.py ../shared/scenes/plush_480 -r 2 --steps 600
 
 Trainings on one thread, alternately without a viewer and with one in which a headless Chromium turns the scene all the
-time, on the machine's other cores. Seconds are those of training.json; processor seconds are those of the training's
-process, the pictures for the visitor included. Without Chromium on PATH there is nothing to measure.
+time. Processor seconds are those of the training's process, the pictures for the visitor included: that is what a
+visitor costs. Seconds on the wall are those of training.json; where Chromium has no graphics card it draws on the same
+cores as the training, whatever cores it is told to keep to, and they tell what that costs.
 """
 
 import argparse
