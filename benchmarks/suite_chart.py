@@ -3,7 +3,8 @@
     python benchmarks/suite_chart.py out/table.csv -o docs/results/methods_plush.png
 
 PSNR on the left, SSIM on the right, over the logarithm of the bytes. Methods at several rates are lines; of this
-project's, which are what the eye is to go to, the lines are thick.
+project's, which are what the eye is to go to, the lines are thick. Variants of a method, whose names begin with the
+same word, share color and marker, and differ in how the marker is filled.
 """
 
 import argparse
@@ -74,18 +75,22 @@ def figure(rows: Sequence[Row], title: str) -> bytes:
 
 def draw(axes: Any, rows: Sequence[Row], measure: str, label: str) -> None:
     names = list(dict.fromkeys(row["method"] for row in rows))
-    others = [name for name in names if not name.startswith(OURS)]
+    families = list(dict.fromkeys(name.split()[0] for name in names if not name.startswith(OURS)))
     for name in names:
         points = sorted((float(row["bytes"]), float(row[measure])) for row in rows if row["method"] == name)
         ours = name.startswith(OURS)
-        place = names.index(name) if ours else others.index(name)
+        family = name.split()[0]
+        variant = [other for other in names if other.split()[0] == family].index(name)
+        place = variant if ours else families.index(family)
         axes.plot(
             *zip(*points, strict=True),
             label=name,
             color=("#0072B2", "#000000")[place % 2] if ours else COLORS[place % len(COLORS)],
             marker="o" if ours else MARKERS[place % len(MARKERS)],
+            fillstyle="full" if ours else ("full", "none", "left")[variant % 3],
             linewidth=2.4 if ours else 1.1,
-            markersize=5,
+            linestyle="-" if len(points) > 1 else "",
+            markersize=6,
         )
     axes.set_xscale("log")
     label_sizes(axes)
