@@ -1,7 +1,7 @@
 """Scenes in tiles: what a border costs, and what memory and time it takes to fly over a city of millions.
 
     python benchmarks/tiles.py seam ONE TWO SCENE [-r 1]
-    python benchmarks/tiles.py city FILE.cgs [--side 12] [--memory 60MB] [--frames 48] [--folder /tmp/city.tiles]
+    python benchmarks/tiles.py city FILE.cgs [--side 12] [--memory 60MB] [--frames 48] [--folder city.tiles]
 
 `seam`: ONE is the run of a scene trained whole, TWO that of the same in tiles. Held-out views of both against the
 photographs: all pixels, and those that show what is near a border. Which these are the scene trained whole says: its
