@@ -1,8 +1,10 @@
 """A method that nobody would publish: masks learned with the splats, then few colors for all of them.
 
-And a check that methods share: that a run may stop anywhere.
+And what the methods' tests share: that a run may stop anywhere, files with something changed, quality.
 """
 
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,12 +14,16 @@ import pytest
 import torch
 from torch import nn
 
-from compgs import methods
+import compgs
+from compgs import methods, metrics, render
 from compgs.config import Config, Range
+from compgs.errors import SplatFileError
 from compgs.formats import SplatArrays
-from compgs.formats.packed import SUFFIX, Packed, packed_bits, splat_model, unpacked_bits, write_packed
+from compgs.formats.packed import SUFFIX, Packed, packed_bits, read, splat_model, unpacked_bits, write_packed
 from compgs.methods import METHODS, SPLAT_SETTINGS, Method
 from compgs.model.splats import SplatModel
+from compgs.render.render_model import Renderable
+from compgs.scene.views import Scene
 from compgs.tensors.splats import Splats
 from compgs.training import Hooks, Phase, fine_tuning, train_phases
 
@@ -160,5 +166,44 @@ def check_continues(blob_scene: Any, tmp_path: Path) -> Any:
             with pytest.raises(KeyboardInterrupt):
                 trained(f"stopped{stop}", stop)
             assert trained(f"stopped{stop}", resume=True) == whole, stop
+
+    return check
+
+
+@pytest.fixture
+def changed() -> Callable[..., Path]:
+    """`changed(file, path, facts, arrays)`: a file with some facts and arrays replaced."""
+
+    def write(file: Path, path: Path, facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Path:
+        found = read(file)
+        write_packed(path, Packed(found.method, {**found.facts, **facts}, {**found.arrays, **arrays}))
+        return path
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def quality() -> Callable[[Renderable, Scene], float]:
+    """dB over the training views: what is coded is what they taught."""
+
+    def of(model: Renderable, scene: Scene) -> float:
+        images = [metrics.to_8bit(render(model, view.camera).image) for view in scene.train_views]
+        pairs = zip(images, scene.train_views, strict=True)
+        return float(np.mean([metrics.psnr(image, view.image) for image, view in pairs]))
+
+    return of
+
+
+@pytest.fixture
+def check_not_converted(tmp_path: Path) -> Callable[[Path], None]:
+    """A check that a file whose splats networks make anew for each camera is neither exported nor compressed."""
+
+    def check(file: Path) -> None:
+        for convert, name in ((compgs.export, "b.ply"), (compgs.compress, "b.cgs")):
+            with pytest.raises(
+                SplatFileError, match=re.escape(f"{file.name}: its splats are made anew for each camera")
+            ):
+                convert(file, tmp_path / name)
+        assert not list(tmp_path.iterdir())
 
     return check

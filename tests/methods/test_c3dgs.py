@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from compgs import metrics
 from compgs.config import SplatConfig, TrainingConfig
 from compgs.errors import SplatFileError
 from compgs.formats import component_bytes, open_scene
@@ -64,12 +63,6 @@ def written(trainer: SplatTrainer, path: Path) -> Path:
     assert isinstance(trainer.hooks, SharedEntries)
     write_packed(path, trainer.hooks.content(trainer), CODECS)
     return path
-
-
-def quality(model: Renderable, scene: Scene) -> float:
-    """dB over the training views: what is coded is what they taught."""
-    images = [metrics.to_8bit(render(model, view.camera).image) for view in scene.train_views]
-    return float(np.mean([metrics.psnr(a, v.image) for a, v in zip(images, scene.train_views, strict=True)]))
 
 
 @pytest.fixture(scope="module")
@@ -220,7 +213,11 @@ def test_what_is_opened_is_what_was_trained(trainer: SplatTrainer, blob_scene: S
 
 
 def test_fine_tuning_gains_over_what_codebooks_lose(
-    trainer: SplatTrainer, plain: SplatModel, blob_scene: Scene, tmp_path: Path
+    trainer: SplatTrainer,
+    plain: SplatModel,
+    blob_scene: Scene,
+    tmp_path: Path,
+    quality: Callable[[Renderable, Scene], float],
 ) -> None:
     config = settings(threshold=1e6)
     clustered = tuned(blob_scene, plain, replace(config, c3dgs=replace(config.c3dgs, tuned=1e-6)))

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from compgs import metrics
 from compgs.config import SplatConfig, TrainingConfig
 from compgs.errors import SplatFileError
 from compgs.formats import component_bytes, open_scene
@@ -48,12 +47,6 @@ def written(trainer: SplatTrainer, path: Path) -> Path:
     assert isinstance(trainer.hooks, LearnedCodebooks)
     write_packed(path, trainer.hooks.content(trainer), ("raw",))
     return path
-
-
-def quality(model: Renderable, scene: Scene) -> float:
-    """dB over the training views: what is coded is what they taught."""
-    images = [metrics.to_8bit(render(model, view.camera).image) for view in scene.train_views]
-    return float(np.mean([metrics.psnr(a, v.image) for a, v in zip(images, scene.train_views, strict=True)]))
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +104,9 @@ def test_splats_have_no_values_of_their_own(trainer: SplatTrainer) -> None:
         assert len(torch.unique(own, dim=0)) > 16, "the values behind the codes go on moving"
 
 
-def test_codes_that_are_learned_lose_less_than_k_means_afterwards(blob_scene: Scene, tmp_path: Path) -> None:
+def test_codes_that_are_learned_lose_less_than_k_means_afterwards(
+    blob_scene: Scene, tmp_path: Path, quality: Callable[[Renderable, Scene], float]
+) -> None:
     config = replace(
         settings(opacity_weight=0.0, codebook=4, harmonics_codebook=4),
         training=TrainingConfig(steps=200, seed=3),

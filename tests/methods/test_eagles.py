@@ -1,6 +1,7 @@
 """EAGLES: integers with linear decoders, coarse images first, pruning by influence."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import torch
 
 from compgs.errors import SplatFileError
 from compgs.formats import component_bytes, open_scene
-from compgs.formats.packed import Packed, read, write_packed
+from compgs.formats.packed import Packed
 from compgs.losses import Target
 from compgs.methods import settings_of, train, write
 from compgs.methods.eagles.file import cosines, decoded
@@ -256,12 +257,6 @@ def test_symbols_of_one_histogram_come_back(count: int, tmp_path: Path) -> None:
     np.testing.assert_array_equal(unpacked_symbols(packed, "x", count), symbols)
 
 
-def changed(file: Path, path: Path, facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> Path:
-    found = read(file)
-    write_packed(path, Packed("eagles", {**found.facts, **facts}, {**found.arrays, **arrays}))
-    return path
-
-
 @pytest.mark.parametrize(
     ("facts", "arrays", "message"),
     [
@@ -280,7 +275,12 @@ def changed(file: Path, path: Path, facts: dict[str, Any], arrays: dict[str, np.
     ],
 )
 def test_damaged_files_are_refused(
-    facts: dict[str, Any], arrays: dict[str, np.ndarray], message: str, file: Path, tmp_path: Path
+    facts: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    message: str,
+    file: Path,
+    tmp_path: Path,
+    changed: Callable[..., Path],
 ) -> None:
     with pytest.raises(SplatFileError, match=message):
         open_scene(changed(file, tmp_path / "b.packed", facts, arrays))

@@ -62,12 +62,6 @@ def written(trainer: SplatTrainer, config: LightGaussianConfig, path: Path) -> P
     return path
 
 
-def quality(model: Renderable, scene: Scene) -> float:
-    """dB over the training views: what is coded is what they taught."""
-    images = [metrics.to_8bit(render(model, view.camera).image) for view in scene.train_views]
-    return float(np.mean([metrics.psnr(a, v.image) for a, v in zip(images, scene.train_views, strict=True)]))
-
-
 @pytest.fixture(scope="module")
 def trainer(blob_scene: Scene, plain: SplatModel) -> SplatTrainer:
     return trained(blob_scene, plain, settings())
@@ -129,7 +123,9 @@ def test_the_splats_that_matter_least_go(blob_scene: Scene, plain: SplatModel) -
     assert np.array_equal(begun.parameters.means.detach().numpy(), plain.splats.means[kept])
 
 
-def test_splats_settle_after_pruning(blob_scene: Scene, plain: SplatModel) -> None:
+def test_splats_settle_after_pruning(
+    blob_scene: Scene, plain: SplatModel, quality: Callable[[Renderable, Scene], float]
+) -> None:
     config = settings()
     pruned = SplatTrainer(blob_scene, config, torch.device("cpu"), plain, Pruned(config.lightgaussian))
     pruned.begin()

@@ -12,7 +12,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from compgs.cli.command import NO_DEFAULT, ComputingCommand
 from compgs.cli.console import console, say
 from compgs.cli.progress import counting, training
-from compgs.cli.settings import with_settings
+from compgs.cli.settings import assigned, with_settings
 from compgs.cli.sizes import parse_size, parse_time
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.words import duration, size
@@ -192,7 +192,7 @@ class Compress(ComputingCommand):
             "training.steps": self.steps,
             "training.seed": self.seed,
         }
-        return (*(f"{name}={value}" for name, value in named.items() if value is not None), *self.set)
+        return assigned(named, self.set)
 
 
 def say_what(compression: "Compression") -> None:

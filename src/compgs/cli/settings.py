@@ -2,12 +2,17 @@
 
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from compgs.cli.usage import OPTIONS, UsageError, settings_of_options
 from compgs.config import Config, config_from_dict
 from compgs.methods import Method
+
+
+def assigned(options: Mapping[str, object], more: Sequence[str]) -> tuple[str, ...]:
+    """Options that are settings, by the settings' names, as `section.key=value`, those that are given; then `more`."""
+    return (*(f"{name}={value}" for name, value in options.items() if value is not None), *more)
 
 
 def with_settings(config: Config, assignments: Iterable[str]) -> Config:

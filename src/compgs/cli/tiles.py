@@ -81,7 +81,8 @@ def check_options(command: "Train") -> None:
 
 def settings_of_tile(place: str) -> RunSettings:
     """Of `RUN/plan.json#NAME`: the run's settings, for one of its tiles. Raises UsageError, CheckpointError."""
-    from compgs.tiles.plan import ground_entry, read_plan
+    from compgs.formats.tiled import ground_entry
+    from compgs.tiles.plan import read_plan
 
     path, mark, name = place.rpartition("#")
     if not mark:
@@ -125,10 +126,11 @@ def cut(model: Any, settings: RunSettings) -> None:
 
 def _ground_and_tile(entry: dict[str, Any]) -> tuple[Any, Any]:
     """Raises CheckpointError for what is none."""
-    from compgs.tiles.plan import Tile, ground_from_entry
+    from compgs.tiles.ground import Ground
+    from compgs.tiles.plan import Tile
 
     try:
-        return ground_from_entry(entry["ground"]), Tile.from_dict(entry)
+        return Ground.from_entry(entry["ground"]), Tile.from_dict(entry)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise CheckpointError(
             f"{SETTINGS_NAME}: not the tile of a plan ({error!s:.200}); train anew"

@@ -34,7 +34,7 @@ from compgs.cli.run_folder import (
     load_settings,
 )
 from compgs.cli.scenes import read_scene
-from compgs.cli.settings import check_settings_of, with_settings
+from compgs.cli.settings import assigned, check_settings_of, with_settings
 from compgs.cli.sizes import parse_cameras, parse_size
 from compgs.cli.tiles import block, check_options, cut, settings_of_tile, train_tiles
 from compgs.cli.usage import UsageError, settings_of_options
@@ -319,7 +319,7 @@ class Train(ComputingCommand, SceneOptions):
             "training.seed": self.seed,
             "training.viewpoints": self.cameras and parse_cameras(self.cameras),
         }
-        return (*(f"{name}={value}" for name, value in named.items() if value is not None), *self.set)
+        return assigned(named, self.set)
 
     def train(
         self,

@@ -96,9 +96,7 @@ class Manifest:
             "world_offset": list(self.world_offset),
             "background": list(self.background),
             "up": list(self.up),
-            "ground": None
-            if self.ground is None
-            else {name: list(value) for name, value in vars(self.ground).items()},
+            "ground": None if self.ground is None else ground_entry(self.ground),
             "viewpoints": [_camera_entry(camera) for camera in self.viewpoints],
             "tiles": [_tile_entry(tile) for tile in self.tiles],
         }
@@ -242,6 +240,16 @@ def core_from_entry(entry: dict[str, Any]) -> Core:
     return core
 
 
+def ground_entry(ground: GroundAxes) -> dict[str, Any]:
+    """As JSON has it."""
+    return {name: list(value) for name, value in vars(ground).items()}
+
+
+def ground_from_entry(entry: dict[str, Any]) -> GroundAxes:
+    """Inverse of `ground_entry`. Raises ValueError, KeyError, TypeError."""
+    return GroundAxes(*(_vector(entry[name]) for name in ("origin", "right", "forward")))
+
+
 def _camera_entry(camera: Camera) -> dict[str, Any]:
     """Digits for a thousandth of the rounding that files of tiles have for their own viewpoints."""
     pose = np.asarray(camera.world_to_camera, np.float64).tolist()
@@ -267,9 +275,7 @@ def _manifest(content: dict[str, Any]) -> Manifest:
         background=_vector(content["background"]),
         up=_vector(content["up"]),
         viewpoints=_list(content["viewpoints"], 0, MOST_TILES, _camera),
-        ground=None
-        if ground is None
-        else GroundAxes(*(_vector(ground[name]) for name in ("origin", "right", "forward"))),
+        ground=None if ground is None else ground_from_entry(ground),
     )
 
 

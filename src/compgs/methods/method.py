@@ -30,6 +30,17 @@ PACKED_SUFFIX = ".packed"
 Presets = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 
+class KnowsItsFile(Protocol):
+    """What a training gives that is the content of a file already, such as `parts.content.Content`."""
+
+    def write(self, path: Path) -> int: ...
+
+
+def write_itself(content: KnowsItsFile, path: Path, config: Any) -> int:
+    """`Method.write` of such methods. Raises OutputError."""
+    return content.write(path)
+
+
 class Trains(Protocol):
     def __call__(self, scene: "Scene", config: Any, run: "Run", start: "SplatModel | None" = None) -> Any: ...
 

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from compgs.cameras import Camera
-from compgs.formats.tiled import GroundAxes
+from compgs.formats.tiled import GroundAxes, ground_from_entry
 from compgs.scene.viewpoints import up_direction
 
 INNER = 0.9  # share of the points, the nearest to the middle, that say how the capture lies: not the far background
@@ -15,6 +16,11 @@ INNER = 0.9  # share of the points, the nearest to the middle, that say how the 
 @dataclass(frozen=True)
 class Ground(GroundAxes):
     """A point of the world, and two directions at right angles to the sky's. Places on it are world units."""
+
+    @classmethod
+    def from_entry(cls, entry: dict[str, Any]) -> "Ground":
+        """Of a plan's JSON. Raises ValueError, KeyError, TypeError."""
+        return cls(**vars(ground_from_entry(entry)))
 
     def places(self, positions: np.ndarray) -> np.ndarray:
         """[P, 2] float64 of positions [P, 3] of the world: what is above one another has one place."""

@@ -6,7 +6,6 @@ A tile holds the anchors in its core, and is trained with the points of its padd
 outer cores have no end: the sky and the far background are theirs.
 """
 
-import dataclasses
 import itertools
 import json
 import math
@@ -20,7 +19,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import CheckpointError, ConfigError
-from compgs.formats.tiled import Core, core_entry, core_from_entry
+from compgs.formats.tiled import Core, core_entry, core_from_entry, ground_entry
 from compgs.outputs import write_json
 from compgs.scene.points import MIN_POINTS, median_spacing
 from compgs.scene.views import Scene
@@ -277,26 +276,9 @@ def read_plan(path: Path) -> Plan:
         if content["schema"] != SCHEMA:
             raise ValueError(f"schema {content['schema']!r}, expected {SCHEMA!r}")
         tiles = tuple(map(Tile.from_dict, content["tiles"]))
-        ground = ground_from_entry(content["ground"])
+        ground = Ground.from_entry(content["ground"])
         return Plan(str(content["scene"]), int(content["columns"]), int(content["rows"]), ground, tiles)
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror}); --tiles makes a plan") from error
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: not a plan of tiles ({error!s:.200}); train anew") from error
-
-
-def ground_entry(ground: Ground) -> dict[str, Any]:
-    """As JSON has it."""
-    return {name: list(value) for name, value in dataclasses.asdict(ground).items()}
-
-
-def ground_from_entry(entry: dict[str, Any]) -> Ground:
-    """Inverse of `ground_entry`. Raises ValueError, KeyError, TypeError."""
-
-    def vector(values: Sequence[Any]) -> tuple[float, float, float]:
-        x, y, z = map(float, values)
-        if not all(map(math.isfinite, (x, y, z))):
-            raise ValueError(f"ground: {values}")
-        return x, y, z
-
-    return Ground(*(vector(entry[name]) for name in ("origin", "right", "forward")))

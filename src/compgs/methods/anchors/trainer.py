@@ -1,7 +1,6 @@
 """Training of such anchors without rate; methods add theirs (`training/loop.py` has the loop)."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,7 @@ from compgs.training.restoring import (
     restoring,
 )
 from compgs.training.seen_points import check_points_seen
-from compgs.training.trainer import vanishing_loss
+from compgs.training.trainer import stations, vanishing_loss
 from compgs.training.views_in_turn import ViewsInTurn
 
 
@@ -320,12 +319,3 @@ PARTS = {
     "observe": "control",
     "finish_step": "control",
 }
-
-
-def stations(
-    loss: Tensor, rendered: RasterResult, gaussians: Gaussians
-) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
-    """Where the gradients of a step arrive, part by part."""
-    yield "loss, backward", (rendered.image,)
-    yield "rasterization, backward", (rendered.means2d,)
-    yield "projection, backward", (gaussians.means, gaussians.quaternions, gaussians.scales)

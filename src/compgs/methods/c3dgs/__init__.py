@@ -8,11 +8,10 @@ of two codebooks; all is then trained as 8 bits will show it.
 """
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from compgs.config import Config, Range
-from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method, write_itself
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -73,10 +72,6 @@ def train(scene: "Scene", config: C3DGSConfig, run: "Run", start: "SplatModel | 
     )
 
 
-def write(content: "Content", path: Path, config: Config) -> int:
-    return content.write(path)
-
-
 def open_file(packed: "Packed", device: "Device", background: tuple[float, float, float]) -> "SplatModel":
     from compgs.formats.packed import splat_model
     from compgs.methods.c3dgs.files import splats_of
@@ -91,7 +86,7 @@ C3DGS = Method(
     suffix=PACKED_SUFFIX,
     uses=(*SPLAT_SETTINGS, NAME),
     train=train,
-    write=write,
+    write=write_itself,
     open=open_file,
     settings=C3DGSConfig,
     presets={"scaled": {NAME: {"codebook_share": 0.1}}},

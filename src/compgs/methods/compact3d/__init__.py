@@ -8,11 +8,10 @@ are learned while the splats are trained; a penalty on opacities makes splats su
 """
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from compgs.config import Config, Range, Share
-from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method, write_itself
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -78,10 +77,6 @@ def train(
     return Content(packed, scene.background, open_file, ("raw",), run.device)
 
 
-def write(content: "Content", path: Path, config: Config) -> int:
-    return content.write(path)
-
-
 def open_file(packed: "Packed", device: "Device", background: tuple[float, float, float]) -> "SplatModel":
     from compgs.formats.packed import splat_model
     from compgs.methods.compact3d.files import splats_of
@@ -96,7 +91,7 @@ COMPACT3D = Method(
     suffix=PACKED_SUFFIX,
     uses=(*SPLAT_SETTINGS, NAME),
     train=train,
-    write=write,
+    write=write_itself,
     open=open_file,
     settings=Compact3DConfig,
     presets={

@@ -7,11 +7,10 @@ What is as published, what is not and why: docs/methods/compact-3dgs.md.
 """
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from compgs.config import Config, LearningRate, Positive, Range, Share, SplatConfig
-from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method, write_itself
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -81,10 +80,6 @@ def train(scene: "Scene", config: CompactConfig, run: "Run", start: "SplatModel 
     return train_compact(scene, config, run)
 
 
-def write(model: "Content", path: Path, config: CompactConfig) -> int:
-    return model.write(path)
-
-
 def open_file(packed: "Packed", device: "Device", background: tuple[float, float, float]) -> "NetworkColored":
     from compgs.methods.compact_3dgs.file import opened
 
@@ -98,7 +93,7 @@ COMPACT_3DGS = Method(
     suffix=PACKED_SUFFIX,
     uses=(*SPLAT_SETTINGS, "compact"),
     train=train,
-    write=write,
+    write=write_itself,
     open=open_file,
     settings=CompactConfig,
     presets={"scaled": {"compact": SCALED}},

@@ -7,11 +7,10 @@ What is as published, what is not and why: docs/methods/eagles.md.
 """
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from compgs.config import Config, LearningRate, Positive, Range, Share, SplatConfig
-from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method, write_itself
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -84,10 +83,6 @@ def train(scene: "Scene", config: EaglesConfig, run: "Run", start: "SplatModel |
     return train_latents(scene, config, run)
 
 
-def write(model: "Content", path: Path, config: EaglesConfig) -> int:
-    return model.write(path)
-
-
 def open_file(packed: "Packed", device: "Device", background: tuple[float, float, float]) -> "SplatModel":
     from compgs.methods.eagles.file import opened
 
@@ -101,7 +96,7 @@ EAGLES = Method(
     suffix=PACKED_SUFFIX,
     uses=(*SPLAT_SETTINGS, "eagles"),
     train=train,
-    write=write,
+    write=write_itself,
     open=open_file,
     settings=EaglesConfig,
     presets={"scaled": {"eagles": SCALED}},

@@ -8,11 +8,10 @@ colors of most splats share a codebook.
 """
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from compgs.config import Config, Range, Share
-from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
+from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method, write_itself
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -90,10 +89,6 @@ def train(
     return Content(content(trainer, config), scene.background, open_file, ("raw", "deflate"), run.device)
 
 
-def write(content: "Content", path: Path, config: Config) -> int:
-    return content.write(path)
-
-
 def open_file(packed: "Packed", device: "Device", background: tuple[float, float, float]) -> "SplatModel":
     from compgs.formats.packed import splat_model
     from compgs.methods.lightgaussian.files import splats_of
@@ -108,7 +103,7 @@ LIGHTGAUSSIAN = Method(
     suffix=PACKED_SUFFIX,
     uses=(*SPLAT_SETTINGS, NAME),
     train=train,
-    write=write,
+    write=write_itself,
     open=open_file,
     settings=LightGaussianConfig,
     presets={"scaled": {NAME: {"codebook_share": 0.1}}},
