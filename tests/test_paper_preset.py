@@ -99,6 +99,7 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         "training.target_bytes": "",
         "training.quantized_weights": "how weights are stored",
         "training.sparse_adam": "off",
+        "training.head_optimizer": "Adam",
         "training.exposure": "off",
         "training.appearance_dtype": "float32",
         "training.entropy_lr_steps": "bounds of short runs",
@@ -112,6 +113,7 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         if section != "splats"
     }
     assert names == PUBLISHED.keys() | free.keys()
+    assert paper.training.head_optimizer == "adam"
     assert paper.training.sparse_adam is False and paper.training.appearance_dtype == "float32"
 
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from compgs.config import TrainingConfig
 from compgs.numerics.compiled import njit, portion
 from compgs.trained_model import TrainedModel
+from compgs.training.soap import Soap, forget_bases
 
 HEAD_GROUPS = ("geometry", "appearance", "translation", "covariance", "opacity", "color")
 ROW_CHUNKS = 32
@@ -52,6 +53,8 @@ def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.A
     }
     groups += [group(name, network.parameters(), head_rates[name]) for name, network in heads.networks()]
     betas = betas_for(config.views_per_step)
+    if config.head_optimizer == "soap":
+        return Soap(groups, HEAD_GROUPS, betas, ADAM_EPSILON)
     return torch.optim.Adam(groups, lr=1e-3, betas=betas, eps=ADAM_EPSILON, fused=True)
 
 
@@ -233,6 +236,7 @@ def replace_parameter(
         group["params"] = [new if p is old else p for p in group["params"]]
     state = optimizer.state.pop(old, None)
     if state:
+        forget_bases(state)
         for moment in ("exp_avg", "exp_avg_sq"):
             state[moment] = (change_moment or change)(state[moment])
         optimizer.state[new] = state

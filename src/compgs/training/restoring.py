@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from compgs.errors import CheckpointError, ConfigError, SceneError
+from compgs.training.soap import BASES
 
 # What Python, torch and numpy raise for content of another kind than was written.
 _MISFITS = (
@@ -56,24 +57,31 @@ def check_tensor(value: Tensor, shape: Sequence[int], dtype: torch.dtype, what: 
         raise ValueError(f"{what}: holds values that are not finite")
 
 
+ADAM = ("step", "exp_avg", "exp_avg_sq")
+
+
 def check_moments(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor]) -> None:
-    """Adam's, by `parameter/moment`. Raises ValueError, KeyError."""
+    """What an optimizer remembers, by `parameter/moment`: Adam's moments, and of matrices perhaps the bases that these
+    are in. Raises ValueError, KeyError.
+    """
+    found: dict[str, set[str]] = {}
     for name, value in tensors.items():
         parameter, moment = name.rsplit("/", 1)
         of = parameters[parameter]
-        shape = () if moment == "step" else of.shape
-        check_tensor(value, shape, torch.float32 if moment == "step" else of.dtype, f"moment {name}")
-        if moment not in ("step", "exp_avg", "exp_avg_sq"):
+        if moment in ADAM:
+            shape: Sequence[int] = () if moment == "step" else of.shape
+        elif moment in BASES and of.dim() == 2:
+            shape = 2 * (of.shape[BASES[moment]],)
+        else:
             raise ValueError(f"{name} is no moment of Adam's")
-        if moment != "exp_avg" and (value < 0).any():
+        check_tensor(value, shape, torch.float32 if moment == "step" else of.dtype, f"moment {name}")
+        if moment in ("step", "exp_avg_sq") and (value < 0).any():
             raise ValueError(f"moment {name}: expected nothing below 0")
-    whole = {
-        f"{name.rsplit('/', 1)[0]}/{moment}"
-        for name in tensors
-        for moment in ("step", "exp_avg", "exp_avg_sq")
-    }
-    if whole != set(tensors):
-        raise ValueError(f"moments are missing, such as {min(whole - set(tensors))}")
+        found.setdefault(parameter, set()).add(moment)
+    for parameter, moments in found.items():
+        missing = {*ADAM, *(BASES if moments & BASES.keys() else ())} - moments
+        if missing:
+            raise ValueError(f"moments are missing, such as {parameter}/{min(missing)}")
 
 
 def restore_statistics(control: Any, names: Sequence[str], extra: Mapping[str, Tensor]) -> None:
