@@ -1,16 +1,16 @@
 """Quality over bytes of all methods of a suite, from the tables that `compgs benchmark` wrote.
 
-    python benchmarks/suite_chart.py out/table.csv -o docs/results/methods_plush.png
+    python benchmarks/suite_chart.py out/scene_plush.csv out/scene_fox.csv -o docs/results/methods.png
 
-PSNR on the left, SSIM on the right, over the logarithm of the bytes. Methods at several rates are lines; of this
-project's, which are what the eye is to go to, the lines are thick. Variants of a method, whose names begin with the
-same word, share color and marker, and differ in how the marker is filled.
+A column for each table, PSNR above, SSIM below, over the logarithm of the bytes. Methods at several rates are lines; of
+this project's, which are what the eye is to go to, the lines are thick. Variants of a method, whose names begin with
+the same word, share color and marker, and differ in how the marker is filled.
 """
 
 import argparse
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from quality_over_bytes_figure import DPI, label_sizes
 
 from compgs.outputs import write_bytes
 
-SIZE = (10.0, 4.6)  # inches
+PANEL = (3.7, 3.5)  # inches
+NAMES = 2.0  # inches, of the methods, beside the panels
 OURS = "compgs"  # what the names of this project's rows begin with
 # Apart in hue for those next to each other in a table, in lightness, too.
 COLORS = (
@@ -43,38 +44,48 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("table", type=Path)
+    parser.add_argument("tables", type=Path, nargs="+")
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--title", default="")
     options = parser.parse_args()
     check_matplotlib()
-    with options.table.open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if not row["method"].endswith("(published)")]
-    write_bytes(options.output, figure(rows, options.title))
+    write_bytes(
+        options.output, figure({path.stem.removeprefix("scene_"): rows_of(path) for path in options.tables})
+    )
 
 
-def figure(rows: Sequence[Row], title: str) -> bytes:
-    """PNG."""
+def rows_of(table: Path) -> list[Row]:
+    """What was measured here."""
+    with table.open(newline="") as file:
+        return [row for row in csv.DictReader(file) if not row["method"].endswith("(published)")]
+
+
+def figure(tables: Mapping[str, Sequence[Row]]) -> bytes:
+    """PNG of tables by their titles."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    canvas, panels = pyplot.subplots(1, 2, figsize=SIZE)
-    for panel, measure, label in ((panels[0], "psnr", "PSNR, dB"), (panels[1], "ssim", "SSIM")):
-        draw(panel, rows, measure, label)
-    lines, names = panels[0].get_legend_handles_labels()
-    canvas.suptitle(title, fontsize=11)
-    canvas.set_layout_engine("tight", rect=(0, 0, 0.8, 1))  # the names stand beside the panels
-    canvas.legend(lines, names, loc="center right", fontsize=9, frameon=False)
+    width, height = len(tables) * PANEL[0] + NAMES, 2 * PANEL[1]
+    canvas, panels = pyplot.subplots(2, len(tables), figsize=(width, height), squeeze=False)
+    names = list(dict.fromkeys(row["method"] for rows in tables.values() for row in rows))
+    for column, (title, rows) in enumerate(tables.items()):
+        panels[0, column].set_title(title, fontsize=11)
+        for panel, measure, label in zip(
+            panels[:, column], ("psnr", "ssim"), ("PSNR, dB", "SSIM"), strict=True
+        ):
+            draw(panel, rows, names, measure, label if column == 0 else "")
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    canvas.set_layout_engine("tight", rect=(0, 0, 1 - NAMES / width, 1))
+    canvas.legend(handles, labels, loc="center right", fontsize=9, frameon=False)
     buffer = io.BytesIO()
     canvas.savefig(buffer, format="png", dpi=DPI)
     pyplot.close(canvas)
     return buffer.getvalue()
 
 
-def draw(axes: Any, rows: Sequence[Row], measure: str, label: str) -> None:
-    names = list(dict.fromkeys(row["method"] for row in rows))
+def draw(axes: Any, rows: Sequence[Row], names: Sequence[str], measure: str, label: str) -> None:
+    """`names`: of all methods of the figure, which look the same in all of its panels."""
     families = list(dict.fromkeys(name.split()[0] for name in names if not name.startswith(OURS)))
     for name in names:
         points = sorted((float(row["bytes"]), float(row[measure])) for row in rows if row["method"] == name)
@@ -83,7 +94,8 @@ def draw(axes: Any, rows: Sequence[Row], measure: str, label: str) -> None:
         variant = [other for other in names if other.split()[0] == family].index(name)
         place = variant if ours else families.index(family)
         axes.plot(
-            *zip(*points, strict=True),
+            [size for size, _ in points],
+            [quality for _, quality in points],
             label=name,
             color=("#0072B2", "#000000")[place % 2] if ours else COLORS[place % len(COLORS)],
             marker="o" if ours else MARKERS[place % len(MARKERS)],
