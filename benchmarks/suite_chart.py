@@ -4,7 +4,8 @@
 
 A column for each table, PSNR above, SSIM below, over the logarithm of the bytes. Methods at several rates are lines; of
 this project's, which are what the eye is to go to, the lines are thick. Variants of a method, whose names begin with
-the same word, share color and marker, and differ in how the marker is filled.
+the same word, share color and marker, and differ in how the marker is filled. What is below this project's worst is not
+drawn.
 """
 
 import argparse
@@ -49,7 +50,7 @@ def main() -> None:
     options = parser.parse_args()
     check_matplotlib()
     write_bytes(
-        options.output, figure({path.stem.removeprefix("scene_"): rows_of(path) for path in options.tables})
+        options.output, figure({path.stem.rpartition("_")[2]: rows_of(path) for path in options.tables})
     )
 
 
@@ -104,6 +105,10 @@ def draw(axes: Any, rows: Sequence[Row], names: Sequence[str], measure: str, lab
             linestyle="-" if len(points) > 1 else "",
             markersize=6,
         )
+    lowest = [float(row[measure]) for row in rows if row["method"].startswith(OURS)]
+    if lowest:  # what failed would flatten all else
+        highest = max(float(row[measure]) for row in rows)
+        axes.set_ylim(min(lowest) - 0.03 * (highest - min(lowest)), highest + 0.03 * (highest - min(lowest)))
     axes.set_xscale("log")
     label_sizes(axes)
     axes.set_xlabel("size of the file", fontsize=10)
