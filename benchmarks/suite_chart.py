@@ -50,7 +50,8 @@ def main() -> None:
     options = parser.parse_args()
     check_matplotlib()
     write_bytes(
-        options.output, figure({path.stem.rpartition("_")[2]: rows_of(path) for path in options.tables})
+        options.output,
+        figure({path.stem.partition("_")[2] or path.stem: rows_of(path) for path in options.tables}),
     )
 
 

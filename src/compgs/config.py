@@ -195,8 +195,8 @@ class TrainingConfig:
     quantized_weights: Share = 0.8
     # Adam moves, and lets decay the moments of, only the anchors in view (Taming 3DGS)
     sparse_adam: bool = False
-    # of the heads' matrices; soap: Adam in the eigenbases of the gradients' moments (`training/soap.py`). Where many
-    # views see a scene from many distances it learns faster, where few do it learns them by heart.
+    # of the heads' matrices; soap: Adam in the eigenbases of the gradients' moments (`training/soap.py`). Of three
+    # captures it learned faster on one (fox), and the few training views of another (brighton) by heart.
     head_optimizer: Literal["adam", "soap"] = "adam"
     # in which the networks of opacity and color compute; bfloat16 is meant for GPUs
     appearance_dtype: Literal["float32", "bfloat16"] = "float32"

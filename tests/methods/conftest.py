@@ -18,7 +18,7 @@ import compgs
 from compgs import methods, metrics, render
 from compgs.config import Config, Range
 from compgs.errors import SplatFileError
-from compgs.formats import SplatArrays
+from compgs.formats import SplatArrays, open_scene
 from compgs.formats.packed import SUFFIX, Packed, packed_bits, read, splat_model, unpacked_bits, write_packed
 from compgs.methods import METHODS, SPLAT_SETTINGS, Method
 from compgs.model.splats import SplatModel
@@ -171,15 +171,26 @@ def check_continues(blob_scene: Any, tmp_path: Path) -> Any:
 
 
 @pytest.fixture
-def changed() -> Callable[..., Path]:
-    """`changed(file, path, facts, arrays)`: a file with some facts and arrays replaced."""
+def changed(tmp_path: Path) -> Callable[..., Path]:
+    """`changed(file, facts, arrays)`: a copy of a file with some facts and arrays replaced."""
 
-    def write(file: Path, path: Path, facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Path:
-        found = read(file)
+    def write(file: Path, facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Path:
+        found, path = read(file), tmp_path / "changed.packed"
         write_packed(path, Packed(found.method, {**found.facts, **facts}, {**found.arrays, **arrays}))
         return path
 
     return write
+
+
+@pytest.fixture
+def check_refused(changed: Callable[..., Path]) -> Callable[..., None]:
+    """`check_refused(file, facts, arrays, message)`: a check that the file so changed does not open, and why."""
+
+    def check(file: Path, facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray], message: str) -> None:
+        with pytest.raises(SplatFileError, match=message):
+            open_scene(changed(file, facts, arrays))
+
+    return check
 
 
 @pytest.fixture(scope="session")

@@ -61,13 +61,14 @@ def soap_step(
     where there are any already.
     """
     (beta1, beta2), g = group["betas"], gradient
-    if not state:
+    fresh = not state
+    if fresh:
         state["step"] = torch.zeros((), device=g.device)
         state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        _follow(state, g, improve)
+    _follow(state, g, improve)
+    if fresh:
         return  # in its own bases a gradient is diagonal: all else would be noise divided by its size
     state["step"] += 1
-    _follow(state, g, improve)
     left, right = state["left_basis"], state["right_basis"]
     m = state["exp_avg"].lerp_(g, 1 - beta1)
     turned = left.t() @ g @ right
