@@ -95,6 +95,7 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         "control.every": "bounds of short runs",
         "control.minimum_share": "bounds of short runs",
         "control.prune_share": "nothing is pruned",
+        "control.prune_less": "nothing is pruned",
         "training.seed": "",
         "training.target_bytes": "",
         "training.quantized_weights": "how weights are stored",

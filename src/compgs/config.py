@@ -149,6 +149,8 @@ class ControlConfig:
     prune_at: Shares = (0.5, 0.6, 0.7)
     # of all blending weights in training views, that go each time
     prune_share: Annotated[float, Range(0, 1, below=True)] = 0.02
+    # of that share, by which it is less where training views are few: what adds little may be all that one view has
+    prune_less: Share = 0.75
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import torch
 from compgs.entropy.quantization import UniformNoise
 from compgs.gaussians import Gaussians
 from compgs.tensors.prediction import Prediction
-from compgs.training.dropout import HIGHEST_OPACITY, share_left_out, thinned
+from compgs.training.dropout import HIGHEST_OPACITY, thinned
 
 
 def every_other(count: int, opacity: float) -> Prediction:
@@ -42,9 +42,3 @@ def test_no_opacity_reaches_one_and_none_is_left_out_where_none_should_be() -> N
     )
     same = every_other(10, 0.5)
     assert thinned(same, 0.0, noise()) is same.gaussians
-
-
-def test_the_share_is_for_few_views_and_falls_to_nothing_with_more() -> None:
-    assert [share_left_out(views, 0.2) for views in (1, 15, 30, 300)] == [0.2, 0.2, 0.0, 0.0]
-    assert share_left_out(24, 0.2) == pytest.approx(0.08)
-    assert share_left_out(5, 0.0) == 0.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from compgs.config import Config
+from compgs.config import Config, ControlConfig
 from compgs.gaussians import Gaussians
 from compgs.render import render
 from compgs.scene.views import Scene, View
@@ -20,7 +20,8 @@ CPU = torch.device("cpu")
 
 
 def with_pruning(config: Config, share: float, at: tuple[float, ...]) -> Config:
-    return replace(config, control=replace(config.control, prune_share=share, prune_at=at))
+    control = replace(config.control, prune_share=share, prune_less=0.0, prune_at=at)  # as with many views
+    return replace(config, control=control)
 
 
 def trained(scene: Scene, config: Config) -> Trainer:
@@ -95,10 +96,10 @@ def test_those_go_that_add_least_and_more_of_them_where_bits_weigh_more(
 
 
 def test_no_pruning_takes_more_than_half(tiny_config: Config) -> None:
-    config = with_pruning(tiny_config, 0.02, ())
-    assert pruned_share(config, 0.002) == pytest.approx(0.02)
-    assert pruned_share(config, 0.054) == pytest.approx(0.06)
-    assert pruned_share(with_pruning(tiny_config, 0.4, ()), 0.054) == 0.5
+    control = ControlConfig(prune_share=0.02)
+    assert pruned_share(control, 0.002, 0.0) == pytest.approx(0.02)
+    assert pruned_share(control, 0.054, 0.0) == pytest.approx(0.06)
+    assert pruned_share(replace(control, prune_share=0.4), 0.054, 0.0) == 0.5
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.3])

@@ -74,7 +74,7 @@ def test_the_share_that_is_left_is_that_of_all_prunings_to_come(blob_scene, tiny
         model.references += 3 * torch.randn(model.references.shape, generator=chance)
     weights = torch.rand(model.anchors, 4, generator=chance, dtype=torch.float64) ** 3
     size = TargetSize(
-        model, make_schedule(control, 40, 8), frozenset({10, 20}), contributions=lambda: weights
+        model, make_schedule(control, 40, 8), frozenset({10, 20}), contributions=lambda: weights, few=0.0
     )
     for step, left in ((5, 0.81), (10, 0.81), (11, 0.9), (21, 1.0)):
         found = size.lasting_share(0.002, step)

@@ -14,13 +14,7 @@ from torch import Tensor
 from compgs.gaussians import Gaussians
 from compgs.tensors.prediction import Prediction
 
-FEW_VIEWS = 15  # and fewer are few; twice as many are not any more
 HIGHEST_OPACITY = 0.9999  # of those that make up for the others
-
-
-def share_left_out(views: int, most: float) -> float:
-    """Share of the primitives that a step leaves out: `most` where training views are few, 0 where they are many."""
-    return most * min(1.0, max(0.0, 2.0 - views / FEW_VIEWS))
 
 
 def thinned(prediction: Prediction, share: float, noise: Callable[[Tensor], Tensor]) -> Gaussians:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from compgs.config import Config
+from compgs.config import ControlConfig
 from compgs.errors import ConfigError, TrainingError
 from compgs.trained_model import TrainedModel
 from compgs.training.control import ControlSchedule, rate_weight
@@ -17,9 +17,11 @@ from compgs.training.rate_control import LOOKS, RateState, due, follow
 SHARES = 10  # times in a run that the effect of later pruning is predicted
 
 
-def pruned_share(config: Config, lmbda: float) -> float:
-    """Share of all blending weights that the anchors removed in one pruning may have together."""
-    return min(0.5, config.control.prune_share * rate_weight(config.control, lmbda))
+def pruned_share(control: ControlConfig, lmbda: float, few: float) -> float:
+    """Share of all blending weights that the anchors removed in one pruning may have together. `few`: `fewness` of the
+    training views.
+    """
+    return min(0.5, control.prune_share * (1.0 - control.prune_less * few) * rate_weight(control, lmbda))
 
 
 class TargetSize:
@@ -31,12 +33,14 @@ class TargetSize:
         schedule: ControlSchedule,
         pruned_at: frozenset[int],
         contributions: Callable[[], Tensor],  # [N, K] of the coupled primitives, to a sample of the views
+        few: float,  # how few the training views are, 0 to 1
     ) -> None:
         self.model = model
         self.config = model.config
         self.schedule = schedule
         self.pruned_at = pruned_at
         self.contributions = contributions
+        self.few = few
         target, least = self.config.training.target_bytes, fixed_bytes(model)
         if target is not None and target <= least:
             raise ConfigError(
@@ -74,6 +78,7 @@ class TargetSize:
         size = self.size()
         total = self.contributions()
         still = sum(at >= step for at in self.pruned_at)
-        kept = worth_keeping(total.sum(1), 1.0 - (1.0 - pruned_share(self.config, lmbda)) ** still)
+        share = pruned_share(self.config.control, lmbda, self.few)
+        kept = worth_keeping(total.sum(1), 1.0 - (1.0 - share) ** still)
         lasting = missed(total, self.config.control.idle_share) & kept[:, None]
         return self.size(lasting) / size if lasting.any() else 1.0

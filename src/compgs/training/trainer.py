@@ -60,8 +60,9 @@ from compgs.training.distributed import (
     sum_over_ranks,
     whole,
 )
-from compgs.training.dropout import share_left_out, thinned
+from compgs.training.dropout import thinned
 from compgs.training.events import Event, at_shares
+from compgs.training.few_views import fewness
 from compgs.training.file_size import fixed_bytes, latent_bytes
 from compgs.training.importance import LOOKED_AT, PRUNED_BY, missed, spread, view_contributions, worth_keeping
 from compgs.training.initial import initial_model
@@ -149,12 +150,13 @@ class Trainer:
         self.noise = UniformNoise(t.seed + 3, self.views.chance, device)
         self.reference_rates: Tensor | None = None  # [reference_dim], once the channels differ in it
         self.settings = RasterSettings(background=scene.background)
-        self.left_out = share_left_out(views, t.left_out)
+        self.few = fewness(views)
+        self.left_out = t.left_out * self.few
         self.step = 0
         self.rate = RateState(t.lmbda)
         self.decorrelated_at = at_shares(config.entropy.decorrelate_at, t.steps)
         pruned_at = at_shares(config.control.prune_at, t.steps)
-        self.target_size = TargetSize(self.model, self.schedule, pruned_at, self.contributions)
+        self.target_size = TargetSize(self.model, self.schedule, pruned_at, self.contributions, self.few)
         self.events = (
             Event(self.schedule.due, self.grow),
             Event(pruned_at.__contains__, self.prune),
@@ -397,7 +399,8 @@ class Trainer:
 
     def prune(self) -> None:
         """Remove the anchors that add least to the training views: what is left of the run makes up for them."""
-        kept = worth_keeping(self.contributions(PRUNED_BY).sum(1), pruned_share(self.config, self.rate.lmbda))
+        share = pruned_share(self.config.control, self.rate.lmbda, self.few)
+        kept = worth_keeping(self.contributions(PRUNED_BY).sum(1), share)
         if kept.any():
             self.control.keep(self.model, self.optimizer, kept)
 
