@@ -291,7 +291,9 @@ def test_a_size_that_was_asked_for_is_compared_with_the_file(
         "bytes": 131_200,
         "miss": pytest.approx(0.0092, abs=1e-4),
     }
+    (folder / "training.json").unlink()  # as a run that was stopped after its last step
     say_miss(folder, 80_000)
+    assert json.loads((folder / "training.json").read_text())["target_bytes"] == 80_000
     out = capsys.readouterr().out
     assert "+64.0 %" in out and "131.2 kB is what these settings reached" in out
 

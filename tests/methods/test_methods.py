@@ -221,7 +221,8 @@ def test_a_run_of_any_method_is_a_folder_that_says_so(
     results = json.loads((run / "results.json").read_text())
     assert (results["method"], results["file"]) == ("toy", "run.packed")
     assert results["bytes"] == (run / "run.packed").stat().st_size == sum(results["components"].values())
-    assert json.loads((run / "training.json").read_text())["method"] == "toy"
+    facts = json.loads((run / "training.json").read_text())
+    assert facts["method"] == "toy" and 0 < facts["encode_seconds"] < 60
     given = ["--method", "spz", "--from-splats", str(run / "run.packed")]
     assert main(["train", str(scene), "-o", str(other), *given]) == 0
     theirs = json.loads((other / "results.json").read_text())

@@ -67,6 +67,8 @@ def finish() -> Callable[..., None]:
         }  # fmt: skip
         (job.folder / "results.json").write_text(json.dumps(results))
         (job.folder / "job.json").write_text(json.dumps(job.asked))
-        (job.folder / "training.json").write_text(json.dumps({"seconds": seconds, "resumed": False}))
+        (job.folder / "training.json").write_text(
+            json.dumps({"seconds": seconds, "resumed": False, "encode_seconds": seconds / 50})
+        )
 
     return finish

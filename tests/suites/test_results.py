@@ -49,6 +49,7 @@ def test_means_over_scenes_and_seeds_and_ratios_to_3dgs(
     ]
     complexity = rows(tmp_path / "out" / "complexity.csv")
     assert float(complexity[0]["train_seconds"]) == 7.5
+    assert float(complexity[0]["encode_seconds"]) == pytest.approx(0.15)
 
 
 def test_each_scene_has_a_table_and_a_file_in_the_survey_s_layout(

@@ -56,6 +56,16 @@ def manifest_of(folder: Path) -> Path:
     return folder / file_name(folder, SUFFIX) / MANIFEST
 
 
+def add_facts(folder: Path, facts: dict[str, Any]) -> dict[str, Any]:
+    """Adds to what training.json says of a run; all of it. Raises OutputError."""
+    path, known = folder / TRAINING_NAME, {}
+    with suppress(OSError, ValueError):  # a run that was stopped after its last step has none
+        known = json.loads(path.read_text(encoding="utf-8"))
+    facts = {**(known if isinstance(known, dict) else {}), **facts}
+    write_json(path, facts)
+    return facts
+
+
 def save_settings(folder: Path, settings: RunSettings) -> None:
     """Raises OutputError."""
     content = {

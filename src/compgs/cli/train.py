@@ -1,6 +1,5 @@
 """`compgs train`: photographs in, one small file out, and proof of what the file is worth."""
 
-import json
 import shlex
 import time
 from collections.abc import Iterator
@@ -29,6 +28,7 @@ from compgs.cli.run_folder import (
     EarlierRun,
     RunSettings,
     SceneSource,
+    add_facts,
     beginning,
     file_name,
     load_settings,
@@ -42,6 +42,7 @@ from compgs.cli.viewing import check_viewing, viewing
 from compgs.errors import MissingSparseModel
 from compgs.extras import require
 from compgs.methods import METHODS, Method, settings_of, train
+from compgs.numerics.compiling import working_seconds
 from compgs.outputs import check_output_folder, write_json
 from compgs.words import duration, size
 
@@ -215,9 +216,11 @@ class Train(ComputingCommand, SceneOptions):
         cut(model, settings)
         method = METHODS[settings.method]
         path = folder / file_name(folder, method.suffix)
-        start = time.perf_counter()
+        start = working_seconds()
         written = method.write(model, path, settings.config)
-        say(f"{path}: {size(written)}, written in {duration(time.perf_counter() - start)}")
+        seconds = working_seconds() - start
+        add_facts(folder, {"encode_seconds": seconds})
+        say(f"{path}: {size(written)}, written in {duration(seconds)}")
         if settings.tile is not None:
             return  # tiles are evaluated together
         self.evaluate(scene, path, folder, settings)
@@ -420,9 +423,7 @@ def say_miss(folder: Path, target: int) -> None:
     written = (folder / file_name(folder)).stat().st_size
     miss = written / target - 1
     say(f"asked {size(target)}, written {size(written)}: {100 * miss:+.1f} %")
-    path = folder / TRAINING_NAME
-    facts = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    write_json(path, {**facts, "target_bytes": target, "bytes": written, "miss": miss})
+    facts = add_facts(folder, {"target_bytes": target, "bytes": written, "miss": miss})
     if abs(miss) > NOTABLE_MISS:
         from compgs.training.rate_control import HIGHEST, LOWEST
 

@@ -27,7 +27,15 @@ from compgs.suites.suite import PublishedRow, Suite
 
 PUBLISHED = " (published)"  # after the name of a method that did not run here
 QUALITY = ("method", "rate", "psnr", "ssim", "lpips", "bytes", "ratio")
-TIMES = ("method", "rate", "train_seconds", "decode_seconds", "frames_per_second", "primitives")
+TIMES = (
+    "method",
+    "rate",
+    "train_seconds",
+    "encode_seconds",
+    "decode_seconds",
+    "frames_per_second",
+    "primitives",
+)
 SURVEY_HEAD = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
 
 

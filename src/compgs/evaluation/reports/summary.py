@@ -27,6 +27,7 @@ NUMBERS = (
     Column("anchors", "anchors", ",.0f"),
     Column("primitives", "primitives", ",.0f"),
     Column("train_seconds", "training, s", ",.0f"),
+    Column("encode_seconds", "encoding, s", ".3f"),
     Column("decode_seconds", "decoding, s", ".3f"),
     Column("frames_per_second", "frames/s", ".1f"),
 )
@@ -62,6 +63,8 @@ def _number(run: Run, name: str) -> float | None:
     if name == "train_seconds":
         # Of a run that went on, the seconds are those of its last part.
         return None if run.training.get("resumed") else run.training.get("seconds")
+    if name == "encode_seconds":
+        return run.training.get(name)
     if name == "frames_per_second":
         seconds = run.value("render_seconds")
         return 1 / seconds if seconds else None
