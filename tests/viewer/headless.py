@@ -24,9 +24,12 @@ WEBGPU_FLAGS = (
 )
 MAX_SECONDS = 240
 POST = """const post = (name, body) => fetch("/" + name, { method: "POST", body });"""
-# Before anything else of the page: remembers what is written to the console.
+# Before anything else of the page: remembers what is written to the console, and makes the page wait a hundred times
+# as long for a graphics device, which a slow machine would else not have in time.
 PRELUDE = """<script>
   window.written = [];
+  const setsTimeout = window.setTimeout;
+  window.setTimeout = (job, after) => setsTimeout(job, after >= 1000 ? 100 * after : after);
   for (const kind of ["info", "warn", "error"]) console[kind] = (line) => written.push(kind + ": " + line);
   %s
 </script>"""
@@ -37,6 +40,7 @@ DRIVER = """<script>(async () => {
   const text = (id) => document.getElementById(id).textContent;
   const drawnWith = (canvas) => ["webgpu", "webgl2"].find((name) => canvas.getContext(name));
   addEventListener("unhandledrejection", (event) => post("failed", String(event.reason)));
+  setsTimeout(() => post("failed", ["not done in time", ...window.written].join("\\n")), %d);
   try {
     const viewer = window.compgsViewer;
     while (!text("error-text") && !text("status").includes(" in ")) await pause();
@@ -107,7 +111,8 @@ def visit(
     `script`: runs before those of the page; a function `beforeCamera(index)` of it is called, and waited for, before
     each camera.
     """
-    driver = DRIVER % (POST, json.dumps([_described(camera) for camera in cameras]))
+    described = json.dumps([_described(camera) for camera in cameras])
+    driver = DRIVER % (POST, 1000 * (MAX_SECONDS - 20), described)  # it says why before this process gives up
     page = page.replace(b"<head>", b"<head>" + (PRELUDE % script).encode(), 1)
     page = page.replace(b"</body>", driver.encode())
     got = _posted(browser, folder, page, flags, query)

@@ -16,7 +16,7 @@ from compgs.render import RasterSettings
 from compgs.viewer.pace import Pace
 from compgs.viewer.shown import FileShown
 from compgs.viewer.stage import OwnThread
-from compgs.viewer.visitor import Lens, Look, Picture, Visitor, lens_of
+from compgs.viewer.visitor import REST_SECONDS, Lens, Look, Picture, Visitor, lens_of
 
 GOLDEN = (
     Path(__file__).parents[1] / "golden" / "default.cgs"
@@ -95,14 +95,17 @@ def test_pictures_are_small_while_the_camera_moves_and_full_when_it_rests(shown:
     with visiting(shown) as (visitor, page):
         until(lambda: page.pictures)
         visitor.moving = Half(0.07)
+        now = time.perf_counter()
+        visitor.clock = lambda: now  # it stands: however slow the machine is, the camera does not rest
         page.pictures.clear()
-        for _ in range(20):
+        for moves in range(1, 5):
             visitor.changed()
-            time.sleep(0.02)
-        until(lambda: page.pictures and page.pictures[-1].full)
+            until(lambda moves=moves: len(page.pictures) >= moves)
+        assert not any(picture.full for picture in page.pictures)
+        now += 2 * REST_SECONDS
+        until(lambda: page.pictures[-1].full)
         time.sleep(0.4)
-    fulls = [picture.full for picture in page.pictures]
-    assert fulls.count(True) == 1 and fulls[-1] and len(fulls) > 2
+    assert [picture.full for picture in page.pictures].count(True) == 1 and page.pictures[-1].full
     assert {picture.image.shape for picture in page.pictures[:-1]} == {(24, 32, 3)}
     assert page.pictures[-1].image.shape == (48, 64, 3)
 
