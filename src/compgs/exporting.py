@@ -126,13 +126,17 @@ def export(
     count = _counter(steps, progress)
 
     origin = (0.0, 0.0, 0.0) if kind in KEEP_WORLD_OFFSET else model.world_offset
+
+    # Splats that are within the limits are asked for their size more than once, and then written: .sog takes seconds.
+    @functools.lru_cache(maxsize=1)
+    def written(splats: Baked) -> bytes:
+        return write(_arrays(splats, model, kind))
+
     if changed:
-        baked, dropped = _limited(
-            model, fitted, limits, refine, lambda b: len(write(_arrays(b, model, kind))), count
-        )
+        baked, dropped = _limited(model, fitted, limits, refine, lambda b: len(written(b)), count)
     else:
         baked, dropped = _splats_of(model, (), MAX_DEGREE, count), 0
-    data = write(_arrays(baked, model, kind))
+    data = written(baked)
     psnr = tuple(_compared(model, _read_back(data, kind, model, chosen), compared, count))
     write_bytes(path, data)
     return Exported(len(data), len(baked.importance), baked.splats.degree, dropped, psnr, origin)
@@ -219,7 +223,9 @@ def _limited(
 
 
 def _cut(baked: Baked, degree: int) -> Baked:
-    """Without the harmonics above a degree."""
+    """Without the harmonics above a degree; itself, where there are none."""
+    if degree >= baked.splats.degree:
+        return baked
     return replace(baked, splats=baked.splats.of_degree(degree))
 
 
