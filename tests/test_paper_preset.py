@@ -58,6 +58,7 @@ PUBLISHED = {
     "training.opacity_lr": (2e-3, 2e-5),
     "training.color_lr": (8e-3, 8e-5),
     "training.entropy_lr": (2e-4, 1e-5),
+    "training.anchor_memory": 1000.0,  # Adam's beta of squared gradients: 0.999
     "training.schedule": "cosine",
     "training.head_warm_up": 0.0,
     "training.hard_rate": 1.0,

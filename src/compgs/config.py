@@ -184,6 +184,8 @@ class TrainingConfig:
     covariance_lr: LearningRates = (4e-3, 4e-5)
     opacity_lr: LearningRates = (2e-3, 2e-5)
     color_lr: LearningRates = (8e-3, 8e-5)
+    # steps whose squared gradients Adam remembers, of what each anchor has for itself; of all else 1 000 (Ref.)
+    anchor_memory: Annotated[float, Range(1, 1e6, above=True)] = 1000.0
     # of all these rates (Sec. 4.1; Ref.: exponential)
     schedule: Literal["cosine", "exponential"] = "cosine"
     # of the steps in which the heads come up to their learning rates

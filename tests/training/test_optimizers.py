@@ -159,3 +159,14 @@ def test_only_heads_warm_up():
     warmed, cold = rates("cosine", warm_up=0.5), rates("cosine")
     assert [a for a, _ in warmed] == [a for a, _ in cold]
     assert [b for _, b in warmed] == pytest.approx([0.0001, 0.0051, 0.01, 0.01, 0.01])
+
+
+@pytest.mark.parametrize("memory", [50.0, 1000.0])
+def test_squares_are_remembered_as_long_as_the_setting_says_of_anchors_and_of_nothing_else(
+    blob_scene, tiny_config, memory: float
+) -> None:
+    config = replace(tiny_config, training=replace(tiny_config.training, anchor_memory=memory))
+    model = initial_model(blob_scene, config)
+    for group in make_optimizer(model, config.training).param_groups:
+        steps = memory if group["name"] in model.anchor_parameters else 1000.0
+        assert group["betas"] == (0.9, 1 - 1 / steps), group["name"]

@@ -24,18 +24,20 @@ from compgs.training.soap import Soap, forget_bases
 HEAD_GROUPS = ("geometry", "appearance", "translation", "covariance", "opacity", "color")
 ROW_CHUNKS = 32
 ADAM_EPSILON = 1e-15  # gradients of single primitives are tiny (3DGS)
-BETAS = (0.9, 0.999)  # Adam's, for one view a step
+BETAS = (0.9, 0.999)  # Adam's, for one view a step; of anchors the second is `training.anchor_memory`'s
 
 
 def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.Adam:
     """Groups carry their name and (first, last) learning rate; `set_learning_rates` moves between them."""
     heads, entropy = model.heads, model.entropy
+    of_anchors = BETAS[0], 1 - 1 / config.anchor_memory
     longer = max(1.0, config.entropy_lr_steps / config.steps)
     entropy_lr = config.entropy_lr[0] * longer, config.entropy_lr[1] * longer
 
     def group(name: str, parameters: Iterable[nn.Parameter], rates: tuple[float, float]) -> dict:
         rates = rates_for(config.views_per_step, rates)
-        return {"name": name, "params": list(parameters), "lr": rates[0], "rates": rates}
+        betas = betas_for(config.views_per_step, of_anchors if name in model.anchor_parameters else BETAS)
+        return {"name": name, "params": list(parameters), "lr": rates[0], "rates": rates, "betas": betas}
 
     groups = [
         group("log_scales", [model.log_scales], config.log_scale_lr),
@@ -52,10 +54,9 @@ def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.A
         "color": config.color_lr,
     }
     groups += [group(name, network.parameters(), head_rates[name]) for name, network in heads.networks()]
-    betas = betas_for(config.views_per_step)
     if config.head_optimizer == "soap":
-        return Soap(groups, HEAD_GROUPS, betas, ADAM_EPSILON)
-    return torch.optim.Adam(groups, lr=1e-3, betas=betas, eps=ADAM_EPSILON, fused=True)
+        return Soap(groups, HEAD_GROUPS, BETAS, ADAM_EPSILON)
+    return torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
 
 
 def parameters_of(optimizer: torch.optim.Optimizer) -> list[nn.Parameter]:
@@ -68,9 +69,9 @@ def rates_for(views: int, rates: tuple[float, float]) -> tuple[float, float]:
     return rates[0] * math.sqrt(views), rates[1] * math.sqrt(views)
 
 
-def betas_for(views: int) -> tuple[float, float]:
-    """Adam's, of steps of so many views."""
-    return BETAS[0] ** views, BETAS[1] ** views
+def betas_for(views: int, betas: tuple[float, float] = BETAS) -> tuple[float, float]:
+    """Adam's, of steps of so many views, from those of steps of one."""
+    return betas[0] ** views, betas[1] ** views
 
 
 def set_learning_rates(
