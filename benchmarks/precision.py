@@ -28,8 +28,9 @@ def quality(model: HybridModel, scene: Scene) -> float:
     return sum(psnr(to_8bit(compgs.render(model, v.camera).image), v.image) for v in views) / len(views)
 
 
-def with_bits(model: TrainedModel, **bits: int) -> TrainedModel:
-    model.config = replace(model.config, entropy=replace(model.config.entropy, **bits))
+def with_bits(model: TrainedModel, *, network_bits: int, head_bits: int) -> TrainedModel:
+    model.config = replace(model.config, entropy=replace(model.config.entropy, network_bits=network_bits))
+    model.head_bits = head_bits
     return model
 
 
@@ -44,7 +45,7 @@ def main() -> None:
     arguments = parser.parse_args()
     scene = compgs.load_scene(arguments.scene, downscale=arguments.r)
     model = load_run(arguments.run)
-    stored = model.config.entropy
+    network_bits, trained = model.config.entropy.network_bits, model.head_bits
 
     rows = torch.nonzero(model.mask.any(1)).view(-1)
     exact = model.quantized(rows, rate=True, stored_weights=False, masked=True).bits
@@ -55,19 +56,19 @@ def main() -> None:
         f"| floats | {floats:.0f} | | | {quality(model.as_hybrid_model(stored_weights=False), scene):.3f} |"
     )
     for bits in (16, 14, 13, 12, 10, 8):
-        with_bits(model, network_bits=bits, head_bits=stored.head_bits)
+        with_bits(model, network_bits=bits, head_bits=trained)
         total = sum(model.estimated_bits().values())
         size = len(write_content(to_content(model)))
         found = quality(model.as_hybrid_model(), scene)
-        mark = " (trained with)" if bits == stored.network_bits else ""
+        mark = " (trained with)" if bits == network_bits else ""
         print(
             f"| {bits} bits{mark} | {total:.0f} | {100 * (total / floats - 1):+.3f} % | {size} | {found:.3f} |"
         )
     print("\n| prediction heads | file, bytes | PSNR, dB |\n|---|---|---|")
     for bits in (16, 12, 10, 8, 7, 6):
-        with_bits(model, network_bits=stored.network_bits, head_bits=bits)
+        with_bits(model, network_bits=network_bits, head_bits=bits)
         size = len(write_content(to_content(model)))
-        mark = " (trained with)" if bits == stored.head_bits else ""
+        mark = " (trained with)" if bits == trained else ""
         print(f"| {bits} bits{mark} | {size} | {quality(model.as_hybrid_model(), scene):.3f} |")
 
 

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from compgs.config import EntropyConfig
 from compgs.entropy.quantization import quantize_weight
 from compgs.model.constants import SHARED_RESIDUALS
 
-BIAS_BITS = 14  # biases are few: they keep more bits than the weights
+MORE_FOR_BIASES = 4  # bits: biases are few
+MOST_BITS = 16
 SHARED_RESIDUAL_BITS = 10  # residual embeddings that all anchors share are few, too
 
 
@@ -19,15 +19,11 @@ class StoredWeights:
     network: int  # of entropy networks
     head: int  # of prediction heads
 
-    @classmethod
-    def of(cls, config: EntropyConfig) -> "StoredWeights":
-        return cls(config.network_bits, config.head_bits)
-
     def bits(self, name: str, tensor: Tensor) -> int:
         """Of a tensor of the heads, by its name in the file."""
         if name == SHARED_RESIDUALS:
             return SHARED_RESIDUAL_BITS
-        return self.head if tensor.dim() > 1 else BIAS_BITS
+        return self.head if tensor.dim() > 1 else min(MOST_BITS, self.head + MORE_FOR_BIASES)
 
     def rounded(self, name: str, tensor: Tensor) -> Tensor:
         """A tensor of the heads as the file will hold it, straight-through."""

@@ -15,10 +15,11 @@ from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.devices import placed
 from compgs.entropy.models import Quantized, make_entropy_model
+from compgs.entropy.quantization import quantize_weight
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.head_weights import HeadDimensions
 from compgs.model.hybrid_model import HybridModel
-from compgs.stored_weights import StoredWeights
+from compgs.stored_weights import SHARED_RESIDUAL_BITS, StoredWeights
 from compgs.tensors.heads import make_heads
 from compgs.tensors.linear import Reader
 from compgs.tensors.primitives import Primitives, every_slot
@@ -47,12 +48,9 @@ class SharedResiduals:
 
     anchor_parameters = ()
 
-    def __init__(
-        self, coupled_primitives: int, residual_dim: int, step: float, weights: StoredWeights
-    ) -> None:
+    def __init__(self, coupled_primitives: int, residual_dim: int, step: float) -> None:
         self.shape = coupled_primitives, residual_dim
         self.step = step
-        self.weights = weights
 
     def start(self, row: Tensor, anchors: int) -> Tensor:
         """[1, K * residual_dim]: the `row` [K * residual_dim] itself."""
@@ -62,7 +60,7 @@ class SharedResiduals:
         """[1, K * residual_dim] for whichever anchors; `stored`: as the file will hold them, straight-through."""
         if not stored:
             return residuals
-        rounded = self.weights.rounded(SHARED_RESIDUALS, self.dequantized(residuals))
+        rounded = quantize_weight(self.dequantized(residuals), SHARED_RESIDUAL_BITS)
         return rounded.view_as(residuals) / self.step
 
     def head_tensors(self, residuals: Tensor) -> dict[str, Tensor]:
@@ -110,9 +108,11 @@ class TrainedModel(nn.Module):
         world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),  # world units, float64
         *,
         reference_dim: int | None = None,  # None: that of the settings
+        width: int | None = None,  # hidden units of the prediction networks; None: those of the settings
     ) -> None:
         super().__init__()
-        m = config.model if reference_dim is None else replace(config.model, reference_dim=reference_dim)
+        m = config.model
+        m = replace(m, reference_dim=reference_dim or m.reference_dim, width=width or m.width)
         n = len(coordinates)
         self.config = config
         self.voxel_size = voxel_size
@@ -122,6 +122,8 @@ class TrainedModel(nn.Module):
         # Cameras of the world that stand for all that the scene was trained on, the first for them best; its sky.
         self.viewpoints: tuple[Camera, ...] = ()
         self.up: tuple[float, float, float] = (0.0, -1.0, 0.0)
+        # Of the prediction networks' weights in the file; training may decide for fewer than the settings say.
+        self.head_bits = config.entropy.head_bits
         self.heads = make_heads(m.heads, HeadDimensions(m.reference_dim, m.residual_dim, m.width))
         self.entropy = make_entropy_model(m, config.entropy)
         self.register_buffer("coordinates", coordinates.to(torch.int32))
@@ -131,9 +133,7 @@ class TrainedModel(nn.Module):
         self.residual_kind: OwnResiduals | SharedResiduals = (
             OwnResiduals()
             if m.residuals
-            else SharedResiduals(
-                m.coupled_primitives, m.residual_dim, config.entropy.residual_step, self.weights
-            )
+            else SharedResiduals(m.coupled_primitives, m.residual_dim, config.entropy.residual_step)
         )
         # [N, K * residual_dim] steps, or [1, K * residual_dim] where all anchors share them
         self.residuals = nn.Parameter(self.residual_kind.start(self.entropy.starting_residuals(), n))
@@ -151,7 +151,9 @@ class TrainedModel(nn.Module):
     def dimensions(self) -> ModelDimensions:
         """As they are now."""
         m = self.config.model
-        return ModelDimensions(self.mask.shape[1], self.reference_dim, m.residual_dim, m.width, m.heads)
+        return ModelDimensions(
+            self.mask.shape[1], self.reference_dim, m.residual_dim, self.heads.dimensions.width, m.heads
+        )
 
     @property
     def device(self) -> torch.device:
@@ -198,7 +200,7 @@ class TrainedModel(nn.Module):
     @property
     def weights(self) -> StoredWeights:
         """How exactly the file will hold the networks' weights."""
-        return StoredWeights.of(self.config.entropy)
+        return StoredWeights(self.config.entropy.network_bits, self.head_bits)
 
     def head_tensors(self) -> dict[str, Tensor]:
         """What the file's section of prediction heads holds, by name, before it is rounded."""

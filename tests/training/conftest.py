@@ -9,7 +9,13 @@ from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig
 def tiny_config() -> Config:
     return Config(
         model=ModelConfig(
-            coupled_primitives=4, reference_dim=8, residuals=True, residual_dim=8, width=16, voxel_size=0.1
+            coupled_primitives=4,
+            reference_dim=8,
+            residuals=True,
+            residual_dim=8,
+            width=16,
+            networks_by_price=False,  # of a hundred anchors, all that tests look at would be of other sizes
+            voxel_size=0.1,
         ),
         control=ControlConfig(start=0.2, stop=0.7, every=0.2, minimum_views=4, gradient_threshold=1e-5),
         training=TrainingConfig(steps=40, seed=3),

@@ -32,10 +32,11 @@ from compgs.training.restoring import (
     check_tensors,
     finite,
     restoring,
+    whole_number,
 )
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
-CHECKPOINT_VERSION = "2"
+CHECKPOINT_VERSION = "3"
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, writer: Writer | None = 
                 "viewpoints": [_camera_entry(camera) for camera in model.viewpoints],
                 "up": list(model.up),
                 "world_offset": list(model.world_offset),
+                "width": model.dimensions.width,
+                "head_bits": model.head_bits,
             }
         ),
         "state": json.dumps(checkpoint.state),
@@ -170,6 +173,7 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     (voxel_size, distance_unit) = finite([scene["voxel_size"], scene["distance_unit"]], 2, "units", above=0.0)
     red, green, blue = finite(scene["background"], 3, "background")
     x, y, z = finite(scene["world_offset"], 3, "world_offset")
+    width = whole_number(scene["width"], 1, config.model.width, "width")
     model = TrainedModel(
         config,
         coordinates,
@@ -178,7 +182,9 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
         (red, green, blue),
         (x, y, z),
         reference_dim=references.shape[1],
+        width=width,
     )
+    model.head_bits = whole_number(scene["head_bits"], 1, config.entropy.head_bits, "head_bits")
     model.viewpoints = tuple(_camera(entry) for entry in scene["viewpoints"])
     up_x, up_y, up_z = finite(scene["up"], 3, "up")
     model.up = (up_x, up_y, up_z)

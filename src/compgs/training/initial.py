@@ -11,6 +11,7 @@ from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
+from compgs.training.network_size import hidden_width
 
 COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
 
@@ -30,7 +31,13 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.training.seed)
         model = TrainedModel(
-            config, torch.from_numpy(coordinates), voxel_size, scene.extent, scene.background, offset
+            config,
+            torch.from_numpy(coordinates),
+            voxel_size,
+            scene.extent,
+            scene.background,
+            offset,
+            width=hidden_width(config, len(coordinates)),
         )
     with torch.no_grad():
         model.log_scales.copy_(

@@ -106,6 +106,13 @@ def check_step(state: Mapping[str, Any], steps: int) -> None:
         raise ValueError(f"step {step!r} of {steps}")
 
 
+def whole_number(value: Any, least: int, most: int, what: str) -> int:
+    """Raises ValueError for anything else."""
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+        raise ValueError(f"{what}: expected {least} to {most}, found {value!r:.60}")
+    return value
+
+
 def finite(values: Any, count: int, what: str, *, above: float = -math.inf) -> tuple[float, ...]:
     """So many numbers of a list. Raises ValueError for anything else."""
     sound = isinstance(values, list) and len(values) == count

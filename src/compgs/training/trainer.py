@@ -76,6 +76,7 @@ from compgs.training.loop import (
     rasterize_step,
     run_to_end,
 )
+from compgs.training.network_size import head_bits
 from compgs.training.optimizers import DECAYS, make_optimizer, parameters_of, set_learning_rates, step_rows
 from compgs.training.profile import StepProfile
 from compgs.training.rate_control import RateState
@@ -154,6 +155,8 @@ class Trainer:
         self.left_out = t.left_out * self.few
         self.step = 0
         self.rate = RateState(t.lmbda)
+        if model is None:
+            self.choose_head_bits()
         self.decorrelated_at = at_shares(config.entropy.decorrelate_at, t.steps)
         pruned_at = at_shares(config.control.prune_at, t.steps)
         self.target_size = TargetSize(self.model, self.schedule, pruned_at, self.contributions, self.few)
@@ -359,6 +362,12 @@ class Trainer:
         self.step += 1
         self.bounds.after_step(self.step)
         self.rate = self.target_size.follow(self.rate, self.step)
+        self.choose_head_bits()
+
+    def choose_head_bits(self) -> None:
+        """As long as the networks do not compute with weights so rounded."""
+        if not self.stored:
+            self.model.head_bits = head_bits(self.config, self.rate.lmbda, self.model.anchors)
 
     def skip(self, looks: StepViews) -> StepResult:
         """A step on views that no anchor is in: nothing can be learned from it."""

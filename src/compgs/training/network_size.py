@@ -1,0 +1,35 @@
+"""How large the prediction networks are: the price of a bit decides (not in the paper).
+
+A bit of the networks adds lambda * RATE_PER_BIT / N to the objective (`losses.rate`), as N anchors share it. With a
+large lambda and few anchors the networks would be a third to a half of the file: there fewer hidden units and coarser
+weights cost less than they save. Where anchors are many, or bits cheap, nothing changes.
+"""
+
+from compgs.config import Config
+
+# Hidden units from a price of a bit on, lambda / N as the run starts (docs/log/2026-11-23-13-networks.md).
+WIDTHS = ((1.5e-6, 24), (3.5e-6, 16), (1.3e-5, 8))
+# And up to a size of the file, where one is asked for.
+WIDTHS_OF_SIZES = ((26_000, 24), (18_000, 16), (9_000, 8))
+# Bits by which weights are shorter, from a price on, lambda / N of the anchors that there are in the end.
+SHORTER = ((3e-6, 1), (3e-5, 2))
+
+
+def hidden_width(config: Config, anchors: int) -> int:
+    """Hidden units of the networks of a run that starts with so many anchors; at most `model.width`."""
+    t = config.training
+    if not config.model.networks_by_price:
+        return config.model.width
+    if t.target_bytes is not None:
+        narrower = [width for size, width in WIDTHS_OF_SIZES if t.target_bytes <= size]
+    else:
+        narrower = [width for price, width in WIDTHS if t.lmbda >= price * anchors]
+    return min([config.model.width, *narrower])
+
+
+def head_bits(config: Config, lmbda: float, anchors: int) -> int:
+    """Of a weight of the networks, sign included; at most `entropy.head_bits`."""
+    most = config.entropy.head_bits
+    if not config.model.networks_by_price:
+        return most
+    return most - max([0, *(bits for price, bits in SHORTER if lmbda >= price * anchors)])

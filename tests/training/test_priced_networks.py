@@ -1,0 +1,87 @@
+"""A run whose networks are smaller because their bits are dear."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import compgs
+from compgs.config import Config
+from compgs.losses import RATE_PER_BIT
+from compgs.scene.views import Scene
+from compgs.training.checkpoint import load_checkpoint
+from compgs.training.network_size import head_bits, hidden_width
+from compgs.training.trainer import Trainer
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def priced(tiny_config: Config) -> Config:
+    return replace(tiny_config, model=replace(tiny_config.model, networks_by_price=True))
+
+
+def of_lambda(config: Config, lmbda: float) -> Config:
+    return replace(config, training=replace(config.training, lmbda=lmbda))
+
+
+def test_the_file_has_the_width_and_no_weight_of_more_bits(
+    blob_scene: Scene, priced: Config, tmp_path: Path
+) -> None:
+    trainer = Trainer(blob_scene, priced, CPU)
+    start = trainer.model.anchors
+    while trainer.step < priced.training.steps:
+        trainer.train_step()
+    trainer.finish()
+    model = trainer.model
+    bits = head_bits(priced, priced.training.lmbda, model.anchors)
+    assert (model.dimensions.width, model.head_bits) == (hidden_width(priced, start), bits) and bits < 7
+    compgs.encode(model, tmp_path / "priced.cgs")
+    decoded = compgs.decode(tmp_path / "priced.cgs", "cpu")
+    for name, tensor in decoded.heads.tensors.items():
+        if tensor.ndim > 1 and np.abs(tensor).max() > 0 and "residual" not in name:
+            levels = tensor / np.abs(tensor[tensor != 0]).min()
+            assert np.abs(levels - np.rint(levels)).max() < 1e-3 and np.abs(levels).max() < 1 << (bits - 1), (
+                name
+            )
+    ours = compgs.render(model.as_hybrid_model(), blob_scene.train_views[0].camera).image
+    theirs = compgs.render(decoded, blob_scene.train_views[0].camera).image
+    assert np.abs(np.asarray(ours) - np.asarray(theirs)).max() < 1e-2
+
+
+def test_a_run_that_goes_on_keeps_width_and_bits(blob_scene: Scene, priced: Config, tmp_path: Path) -> None:
+    whole = Trainer(blob_scene, priced, CPU)
+    for _ in range(36):
+        whole.train_step()
+    whole.save(tmp_path / "checkpoint")
+    saved = load_checkpoint(tmp_path / "checkpoint").model
+    assert (saved.dimensions.width, saved.head_bits) == (whole.model.dimensions.width, whole.model.head_bits)
+    again = Trainer.resumed(blob_scene, tmp_path / "checkpoint", priced, CPU)
+    for trainer in (whole, again):
+        trainer.train_step()
+    assert again.model.head_bits == whole.model.head_bits < 7
+    for name, parameter in whole.model.named_parameters():
+        assert torch.equal(parameter, again.model.get_parameter(name)), name
+
+
+def test_bits_are_settled_once_the_networks_compute_with_them(blob_scene: Scene, priced: Config) -> None:
+    trainer = Trainer(blob_scene, of_lambda(priced, 1e-9), CPU)
+    assert trainer.model.head_bits == 7
+    trainer.rate = replace(trainer.rate, lmbda=1.0)
+    trainer.choose_head_bits()
+    assert trainer.model.head_bits == 5
+    trainer.step = int(priced.training.quantized_weights * priced.training.steps)
+    trainer.rate = replace(trainer.rate, lmbda=1e-9)
+    trainer.choose_head_bits()
+    assert trainer.model.head_bits == 5
+
+
+def test_the_price_is_what_a_bit_of_the_networks_adds_to_the_objective() -> None:
+    """B bits shared by N anchors add lambda * RATE_PER_BIT * B / N, as B / N more bits of each anchor would."""
+    anchors, lmbda, bits = 500, 0.01, 1000.0
+    stream = {"all": torch.full((anchors,), 20.0)}
+    more = {"all": stream["all"] + bits / anchors}
+    rates = [float(compgs.losses.rate(b, {"all": 1}, "bits")) for b in (stream, more)]
+    assert lmbda * (rates[1] - rates[0]) == pytest.approx(RATE_PER_BIT * bits * lmbda / anchors, rel=1e-4)
