@@ -67,8 +67,8 @@ class ModelConfig:
     residuals: bool = False
     # hidden width of the residual MLPs (Ref.)
     width: Annotated[int, Range(8, 256, multiple=8)] = 32
-    # networks are narrower, and their weights of fewer bits, than `width` and `head_bits` say where lambda is large and
-    # anchors are few: they would be a third of the file and more (not in the paper)
+    # networks are narrower, and their weights of fewer bits, than `width` and `head_bits` say where they would be a
+    # sixth of the file and more: a large lambda and few anchors, or a small file that is asked for (not in the paper)
     networks_by_price: bool = True
     # separate: four networks (Sec. 3.2); paired: geometry, appearance
     heads: Literal["separate", "paired"] = "paired"

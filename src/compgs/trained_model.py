@@ -15,11 +15,10 @@ from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.devices import placed
 from compgs.entropy.models import Quantized, make_entropy_model
-from compgs.entropy.quantization import quantize_weight
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.head_weights import HeadDimensions
 from compgs.model.hybrid_model import HybridModel
-from compgs.stored_weights import SHARED_RESIDUAL_BITS, StoredWeights
+from compgs.stored_weights import StoredWeights
 from compgs.tensors.heads import make_heads
 from compgs.tensors.linear import Reader
 from compgs.tensors.primitives import Primitives, every_slot
@@ -34,7 +33,7 @@ class OwnResiduals:
         """[N, K * residual_dim] of so many anchors, from the `row` [K * residual_dim] that a new anchor gets."""
         return row.repeat(anchors, 1)
 
-    def of_anchors(self, residuals: Tensor, rows: Tensor | None, *, stored: bool) -> Tensor:
+    def of_anchors(self, residuals: Tensor, rows: Tensor | None, stored: StoredWeights | None) -> Tensor:
         """[V, K * residual_dim] of the anchors in `rows` [V] int64 (None: of all), before they are quantized."""
         return residuals if rows is None else residuals.index_select(0, rows)
 
@@ -56,11 +55,11 @@ class SharedResiduals:
         """[1, K * residual_dim]: the `row` [K * residual_dim] itself."""
         return row.repeat(1, 1)
 
-    def of_anchors(self, residuals: Tensor, rows: Tensor | None, *, stored: bool) -> Tensor:
-        """[1, K * residual_dim] for whichever anchors; `stored`: as the file will hold them, straight-through."""
-        if not stored:
+    def of_anchors(self, residuals: Tensor, rows: Tensor | None, stored: StoredWeights | None) -> Tensor:
+        """[1, K * residual_dim] for whichever anchors; with `stored` as the file will hold them, straight-through."""
+        if stored is None:
             return residuals
-        rounded = quantize_weight(self.dequantized(residuals), SHARED_RESIDUAL_BITS)
+        rounded = stored.rounded(SHARED_RESIDUALS, self.dequantized(residuals))
         return rounded.view_as(residuals) / self.step
 
     def head_tensors(self, residuals: Tensor) -> dict[str, Tensor]:
@@ -222,16 +221,17 @@ class TrainedModel(nn.Module):
             return parameter if rows is None else parameter.index_select(0, rows)
 
         e = self.config.entropy
+        stored = self.weights if stored_weights else None
         references = chosen(self.references)
         covariances = chosen(self.log_scales) / self.entropy.covariance_step
-        residuals = self.residual_kind.of_anchors(self.residuals, rows, stored=stored_weights)
+        residuals = self.residual_kind.of_anchors(self.residuals, rows, stored)
         latents = self.entropy(
             references,
             covariances,
             residuals,
             rate=rate,
             noise=noise,
-            network_bits=self.weights.network if stored_weights else None,
+            network_bits=stored.network if stored else None,
             mask=mask,
         )
         if e.quantized:

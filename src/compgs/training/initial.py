@@ -11,7 +11,7 @@ from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
-from compgs.training.network_size import hidden_width
+from compgs.training.network_size import head_bits, hidden_width
 
 COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
 
@@ -39,6 +39,7 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
             offset,
             width=hidden_width(config, len(coordinates)),
         )
+    model.head_bits = head_bits(config, config.training.lmbda, model.anchors)
     with torch.no_grad():
         model.log_scales.copy_(
             torch.from_numpy(np.log(anchor_spacing(coordinates))).float()[:, None].expand(-1, 6)

@@ -101,9 +101,7 @@ def restore_chance(generator: torch.Generator, extra: Mapping[str, Tensor]) -> N
 
 def check_step(state: Mapping[str, Any], steps: int) -> None:
     """Of the run's state. Raises ValueError for a step outside of the run."""
-    step = state["step"]
-    if not isinstance(step, int) or isinstance(step, bool) or not 0 <= step <= steps:
-        raise ValueError(f"step {step!r} of {steps}")
+    whole_number(state["step"], 0, steps, "step")
 
 
 def whole_number(value: Any, least: int, most: int, what: str) -> int:

@@ -155,8 +155,6 @@ class Trainer:
         self.left_out = t.left_out * self.few
         self.step = 0
         self.rate = RateState(t.lmbda)
-        if model is None:
-            self.choose_head_bits()
         self.decorrelated_at = at_shares(config.entropy.decorrelate_at, t.steps)
         pruned_at = at_shares(config.control.prune_at, t.steps)
         self.target_size = TargetSize(self.model, self.schedule, pruned_at, self.contributions, self.few)
