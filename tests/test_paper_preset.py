@@ -96,7 +96,7 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         "control.start": "bounds of short runs",
         "control.every": "bounds of short runs",
         "control.minimum_share": "bounds of short runs",
-        "control.prune_share": "nothing is pruned",
+        "control.prune_worth": "nothing is pruned",
         "control.prune_less": "nothing is pruned",
         "training.seed": "",
         "training.target_bytes": "",

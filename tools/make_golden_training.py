@@ -39,13 +39,13 @@ CONFIG = Config(
         gradient_threshold=1e-5,
         minimum_views=2,
         growth_probabilities=(0.5, 0.4, 0.3),
-        prune_share=0.005,
+        prune_worth=300.0,
         opacity_threshold=0.01,
         prune_at=(0.55, 0.7),
         idle_share=0.01,
     ),
     training=TrainingConfig(
-        steps=60, seed=11, target_bytes=3_600, rate_start=0.05, hard_rate=0.75, sparse_adam=True
+        steps=60, seed=11, target_bytes=3_000, rate_start=0.05, hard_rate=0.75, sparse_adam=True
     ),
 )
 

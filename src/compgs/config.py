@@ -127,7 +127,7 @@ class ControlConfig:
     observe_passes: Annotated[float, Range(0, 1e6, below=True)] = 0.0
     # mean norm of the 2D gradient, in units of half the image
     gradient_threshold: Annotated[float, Range(0, 1e6, above=True, below=True)] = 1e-4
-    # threshold and pruned share grow with this power of lambda / 0.002: anchors cost bits
+    # the threshold grows with this power of lambda / 0.002: anchors cost bits
     rate_exponent: Annotated[float, Range(0, 2)] = 1 / 3
     # a primitive seen less often is not judged (Ref.: more than 40), ...
     minimum_views: Annotated[int, Range(0, 1 << 31, below=True)] = 20
@@ -148,11 +148,12 @@ class ControlConfig:
     finer_needs_coarser: bool = False
     # of all blending weights in training views: what adds no more is left out of the file
     idle_share: Annotated[float, Range(0, 1, below=True)] = 0.002
-    # of the steps: the anchors that add least are removed
+    # of the steps: the anchors that are not worth their bits are removed
     prune_at: Shares = (0.5, 0.6, 0.7)
-    # of all blending weights in training views, that go each time
-    prune_share: Annotated[float, Range(0, 1, below=True)] = 0.02
-    # of that share, by which it is less where training views are few: what adds little may be all that one view has
+    # what a mean squared change of the training views costs, in units of the loss, as pruning reckons
+    # (`training/pruning.py`)
+    prune_worth: Annotated[float, Range(0, 1e9, above=True, below=True)] = 20.0
+    # by which a bit is cheaper to it where training views are few: what adds little may be all that one view has
     prune_less: Share = 0.75
 
 

@@ -281,11 +281,15 @@ class TrainedModel(nn.Module):
         return placed(model, self.device)
 
     @torch.no_grad()
-    def estimated_bits(self, mask: Tensor | None = None) -> dict[str, float]:
-        """Bits of each stream of the file, by the model's own probabilities (weights and positions not included), if
-        the coupled primitives of `mask` [N, K] bool existed; default: those that do.
+    def bits_of_anchors(self, mask: Tensor | None = None) -> dict[str, Tensor]:
+        """Bits [n] of each stream of the file for the anchors that have one of the coupled primitives of `mask` [N, K]
+        bool (default: of those that exist), by the model's own probabilities; weights and positions not included.
         """
         mask = self.mask if mask is None else mask
         coded = torch.nonzero(mask.any(1)).view(-1)
-        bits = self.quantized(coded, rate=True, mask=mask.index_select(0, coded)).bits
+        return self.quantized(coded, rate=True, mask=mask.index_select(0, coded)).bits
+
+    def estimated_bits(self, mask: Tensor | None = None) -> dict[str, float]:
+        """Sums of `bits_of_anchors`."""
+        bits = self.bits_of_anchors(mask)
         return {name: float(b.sum(dtype=torch.float64)) for name, b in bits.items()}

@@ -66,31 +66,36 @@ def test_lambda_moves_by_the_formula(
 
 
 def test_the_share_that_is_left_is_that_of_all_prunings_to_come(blob_scene, tiny_config):
-    """Two prunings of a tenth leave 0.9^2 of the blending weights, and the file then has no idle primitives."""
-    control = replace(tiny_config.control, prune_share=0.1, idle_share=0.05)
+    """Each further pruning counts as half a lambda more, and the file then has no idle primitives."""
+    control = replace(tiny_config.control, prune_worth=20.0, idle_share=0.05)
     model = initial_model(blob_scene, replace(tiny_config, control=control))
     chance = torch.Generator().manual_seed(0)
     with torch.no_grad():
         model.references += 3 * torch.randn(model.references.shape, generator=chance)
     weights = torch.rand(model.anchors, 4, generator=chance, dtype=torch.float64) ** 3
+    changes = torch.rand(model.anchors, generator=chance, dtype=torch.float64)
     size = TargetSize(
-        model, make_schedule(control, 40, 8), frozenset({10, 20}), contributions=lambda: weights, few=0.0
-    )
-    for step, left in ((5, 0.81), (10, 0.81), (11, 0.9), (21, 1.0)):
-        found = size.lasting_share(0.002, step)
+        model, make_schedule(control, 40, 8), frozenset({10, 20}),
+        contributions=lambda: weights, changes=lambda: changes, few=0.0,
+    )  # fmt: skip
+    with torch.no_grad():
+        streams = model.quantized(rate=True, mask=model.mask).bits.values()
+    worth = 20 * changes / (sum(stream.double() for stream in streams) + 10)
+    ascending = worth.sort().values[model.anchors // 5 :]
+    lmbda = float(ascending[0] + ascending[1]) / 2 * model.anchors * 132 / 5
+    flat = weights.view(-1).sort(descending=True)
+    idle = flat.values[int((flat.values.cumsum(0) < 0.95 * weights.sum()).sum())]
+    before = latent_bytes(model)
+    found = {}
+    for step, dearer in ((5, 1.5), (10, 1.5), (11, 1.0), (21, 0.0)):
+        found[step] = size.lasting_share(lmbda, step)
         assert model.mask.all(), "the model is as it was"
-        order = weights.sum(1).argsort(descending=True)
-        needed = int((weights.sum(1)[order].cumsum(0) < left * weights.sum()).sum()) + 1
-        kept = torch.zeros(model.anchors, dtype=torch.bool)
-        kept[order[:needed]] = True
-        flat = weights.view(-1).sort(descending=True)
-        idle = flat.values[int((flat.values.cumsum(0) < 0.95 * weights.sum()).sum())]
-        before = latent_bytes(model)
+        kept = worth >= lmbda * dearer * 5 / 132 / model.anchors
         model.mask = kept[:, None] & (weights >= idle)
         expected = latent_bytes(model) / before
         model.mask = torch.ones_like(model.mask)
-        assert found == pytest.approx(expected, rel=0.005), step
-        assert found < left
+        assert found[step] == pytest.approx(expected, rel=0.005), step
+    assert found[5] == found[10] < 0.9 * found[11] < 0.8 * found[21] < 0.8
 
 
 @pytest.mark.parametrize(("target", "limit"), [(1e3, HIGHEST), (1e7, LOWEST)])

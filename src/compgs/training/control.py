@@ -88,7 +88,7 @@ def make_schedule(config: ControlConfig, steps: int, views: int, views_per_step:
 
 
 def rate_weight(config: ControlConfig, lmbda: float) -> float:
-    """How much more an anchor has to add to the image than at the usual lambda, since it costs bits."""
+    """How much more an anchor has to promise than at the usual lambda, since it costs bits."""
     least, most = LAMBDA_RANGE
     return (min(max(lmbda, least), most) / USUAL_LAMBDA) ** config.rate_exponent
 

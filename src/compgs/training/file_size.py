@@ -22,6 +22,12 @@ def latent_bytes(model: TrainedModel, mask: Tensor | None = None) -> float:
     return (sum(model.estimated_bits(mask).values()) + POSITION_BITS * anchors) / 8
 
 
+def anchor_bits(model: TrainedModel) -> Tensor:
+    """[N] bits of each anchor's latents and position, all anchors being coded."""
+    bits = model.bits_of_anchors()
+    return torch.stack(list(bits.values())).sum(0) + POSITION_BITS
+
+
 @torch.no_grad()
 def fixed_bytes(model: TrainedModel) -> int:
     """Bytes of the networks and of all else that does not grow with the scene; no lambda makes them fewer."""

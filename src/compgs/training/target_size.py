@@ -6,22 +6,16 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from compgs.config import ControlConfig
 from compgs.errors import ConfigError, TrainingError
 from compgs.trained_model import TrainedModel
-from compgs.training.control import ControlSchedule, rate_weight
-from compgs.training.file_size import fixed_bytes, latent_bytes
-from compgs.training.importance import missed, worth_keeping
+from compgs.training.control import ControlSchedule
+from compgs.training.file_size import anchor_bits, fixed_bytes, latent_bytes
+from compgs.training.importance import missed
+from compgs.training.pruning import paying
 from compgs.training.rate_control import LOOKS, RateState, due, follow
 
 SHARES = 10  # times in a run that the effect of later pruning is predicted
-
-
-def pruned_share(control: ControlConfig, lmbda: float, few: float) -> float:
-    """Share of all blending weights that the anchors removed in one pruning may have together. `few`: `fewness` of the
-    training views.
-    """
-    return min(0.5, control.prune_share * (1.0 - control.prune_less * few) * rate_weight(control, lmbda))
+LATER = 0.5  # by which each further pruning is as if lambda were higher, about (plush_480, fox; 1 500 steps)
 
 
 class TargetSize:
@@ -33,6 +27,7 @@ class TargetSize:
         schedule: ControlSchedule,
         pruned_at: frozenset[int],
         contributions: Callable[[], Tensor],  # [N, K] of the coupled primitives, to a sample of the views
+        changes: Callable[[], Tensor],  # [N] of a sample of the views without an anchor, see `pruning.paying`
         few: float,  # how few the training views are, 0 to 1
     ) -> None:
         self.model = model
@@ -40,6 +35,7 @@ class TargetSize:
         self.schedule = schedule
         self.pruned_at = pruned_at
         self.contributions = contributions
+        self.changes = changes
         self.few = few
         target, least = self.config.training.target_bytes, fixed_bytes(model)
         if target is not None and target <= least:
@@ -78,7 +74,14 @@ class TargetSize:
         size = self.size()
         total = self.contributions()
         still = sum(at >= step for at in self.pruned_at)
-        share = pruned_share(self.config.control, lmbda, self.few)
-        kept = worth_keeping(total.sum(1), 1.0 - (1.0 - share) ** still)
-        lasting = missed(total, self.config.control.idle_share) & kept[:, None]
+        lasting = missed(total, self.config.control.idle_share)
+        if still:
+            lasting &= self.lasting_anchors(lmbda, still)[:, None]
         return self.size(lasting) / size if lasting.any() else 1.0
+
+    def lasting_anchors(self, lmbda: float, still: int) -> Tensor:
+        """[N] bool: those that outlast so many prunings. One after the other takes what a single one would at a higher
+        price: by then the others have taken over.
+        """
+        dearer = lmbda * (1.0 + LATER * (still - 1))
+        return paying(self.changes(), anchor_bits(self.model), dearer, self.config.control, self.few)

@@ -63,8 +63,8 @@ from compgs.training.distributed import (
 from compgs.training.dropout import thinned
 from compgs.training.events import Event, at_shares
 from compgs.training.few_views import fewness
-from compgs.training.file_size import fixed_bytes, latent_bytes
-from compgs.training.importance import LOOKED_AT, PRUNED_BY, missed, spread, view_contributions, worth_keeping
+from compgs.training.file_size import anchor_bits, fixed_bytes, latent_bytes
+from compgs.training.importance import LOOKED_AT, PRUNED_BY, missed, spread, view_contributions
 from compgs.training.initial import initial_model
 from compgs.training.loop import (
     Run,
@@ -79,11 +79,12 @@ from compgs.training.loop import (
 from compgs.training.network_size import head_bits
 from compgs.training.optimizers import DECAYS, make_optimizer, parameters_of, set_learning_rates, step_rows
 from compgs.training.profile import StepProfile
+from compgs.training.pruning import paying, squared_changes
 from compgs.training.rate_control import RateState
 from compgs.training.restoring import check_tensor, restore_chance, restore_statistics, restoring
 from compgs.training.seen_points import check_points_seen
 from compgs.training.step_views import Noise, StepViews, step_views
-from compgs.training.target_size import TargetSize, pruned_share
+from compgs.training.target_size import TargetSize
 from compgs.training.views_in_turn import ViewsInTurn
 
 METHOD = "compgs"
@@ -157,7 +158,9 @@ class Trainer:
         self.rate = RateState(t.lmbda)
         self.decorrelated_at = at_shares(config.entropy.decorrelate_at, t.steps)
         pruned_at = at_shares(config.control.prune_at, t.steps)
-        self.target_size = TargetSize(self.model, self.schedule, pruned_at, self.contributions, self.few)
+        self.target_size = TargetSize(
+            self.model, self.schedule, pruned_at, self.contributions, self.changes, self.few
+        )
         self.events = (
             Event(self.schedule.due, self.grow),
             Event(pruned_at.__contains__, self.prune),
@@ -405,9 +408,9 @@ class Trainer:
         return means, scales
 
     def prune(self) -> None:
-        """Remove the anchors that add least to the training views: what is left of the run makes up for them."""
-        share = pruned_share(self.config.control, self.rate.lmbda, self.few)
-        kept = worth_keeping(self.contributions(PRUNED_BY).sum(1), share)
+        """Remove the anchors that are not worth their bits: what is left of the run makes up for them."""
+        changes, bits = self.changes(PRUNED_BY), anchor_bits(self.model)
+        kept = paying(changes, bits, self.rate.lmbda, self.config.control, self.few)
         if kept.any():
             self.control.keep(self.model, self.optimizer, kept)
 
@@ -422,18 +425,34 @@ class Trainer:
 
     def contributions(self, most: int = LOOKED_AT) -> Tensor:
         """[N, K] float64: what the coupled primitives add to the training views, or to at most `most` of them."""
-
-        def predicted(camera: Camera) -> tuple[Tensor, Prediction] | None:
-            rows = self.visible_anchors(camera)
-            if len(rows) == 0:
-                return None
-            return rows, self.predict(self.model.quantized(rows), rows, camera, stored=True)
-
-        shape = self.model.anchors, self.model.dimensions.coupled_primitives
         views = mine(spread(self.scene.train_views, most))
-        total = view_contributions(views, predicted, shape, self.settings, self.device)
+        total = view_contributions(views, self.predicted, self.shape, self.settings, self.device)
         sum_over_ranks(total)
         return total
+
+    def changes(self, most: int = LOOKED_AT) -> Tensor:
+        """[N] float64: mean squared change of a value of the training views, or of at most `most` of them, without an
+        anchor.
+        """
+        views = spread(self.scene.train_views, most)
+        numbered = mine([(self.step * len(views) + number, view) for number, view in enumerate(views)])
+        total = squared_changes(numbered, self.predicted, self.shape, self.settings, self.device)
+        sum_over_ranks(total)
+        return total / sum(3 * view.camera.width * view.camera.height for view in views)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """N, K."""
+        return self.model.anchors, self.model.dimensions.coupled_primitives
+
+    def predicted(self, camera: Camera) -> tuple[Tensor, Prediction] | None:
+        """The anchors [V] that a camera may show and their primitives as the file would have them; None if there are
+        none.
+        """
+        rows = self.visible_anchors(camera)
+        if len(rows) == 0:
+            return None
+        return rows, self.predict(self.model.quantized(rows), rows, camera, stored=True)
 
     # the run -------------------------------------------------------------------------------------------------------
 

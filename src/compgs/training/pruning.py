@@ -1,0 +1,82 @@
+"""Anchors pay for themselves: those go whose bits cost more than the error that they keep away (not in the paper).
+
+Without anchor n the images of the training views would change by d_n. Where the loss is as small as it gets, it is
+flat: what an anchor keeps away from it is of second order, WORTH times the mean of d_n^2 over all values of all views,
+part of which the other anchors take over in what is left of the run. Its bits b_n cost lambda * RATE_PER_BIT / N * b_n,
+as in the objective (`losses.rate`).
+
+The squares need no image without the anchor. With random signs s of the values, the expectation of (sum of s d_n)^2 is
+the sum of d_n^2 (Hutchinson 1989), and one backward pass gives the sums of s d_n of all anchors at once. Each view has
+one draw of signs. Blending weights (`importance.py`) would be as cheap, but an anchor before another of the same color
+has large ones, and nobody would miss it.
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from compgs.cameras import Camera
+from compgs.config import ControlConfig
+from compgs.losses import RATE_PER_BIT
+from compgs.render import RasterSettings
+from compgs.scene.views import View
+from compgs.tensors.contributions import signed_changes
+from compgs.tensors.prediction import Prediction
+
+MOST = 0.5  # of the anchors, that one pruning takes: what replaces each other must not go together
+
+
+@torch.no_grad()
+def squared_changes(
+    views: Sequence[tuple[int, View]],  # with numbers that tell their draws apart
+    predicted: Callable[[Camera], tuple[Tensor, Prediction] | None],
+    shape: tuple[int, int],  # N, K
+    settings: RasterSettings,
+    device: torch.device,
+) -> Tensor:  # [N] float64, 1 for a value that goes from 0 to 1
+    """Estimated squared changes of the views' images without an anchor, summed over all their values.
+
+    `predicted`: for a camera, the visible anchors [V] and their prediction, or None if no anchor is visible.
+    """
+    total = torch.zeros(shape[0], dtype=torch.float64, device=device)
+    for number, view in views:
+        seen = predicted(view.camera)
+        if seen is None:
+            continue
+        rows, prediction = seen
+        signs = random_signs(number, (view.camera.height, view.camera.width, 3), device)
+        changes = signed_changes(prediction.gaussians, view.camera, signs, settings).double()
+        # [V, K], so that an anchor's are summed in the same order everywhere
+        slots = changes.new_zeros(len(rows) * shape[1])
+        slots[prediction.index] = changes
+        total[rows] += slots.view(len(rows), shape[1]).sum(1) ** 2
+    return total
+
+
+def random_signs(seed: int, shape: tuple[int, ...], device: torch.device) -> Tensor:
+    """-1 or 1, float32."""
+    chance = torch.Generator(device).manual_seed(seed)
+    return torch.randint(0, 2, shape, generator=chance, device=device).float() * 2.0 - 1.0
+
+
+def bit_price(lmbda: float, anchors: int) -> float:
+    """What a bit of one of so many anchors adds to the objective."""
+    return lmbda * RATE_PER_BIT / anchors
+
+
+def paying(
+    changes: Tensor,  # [N] mean squared change of a value of the training views
+    bits: Tensor,  # [N] of each anchor
+    lmbda: float,
+    control: ControlConfig,
+    few: float,  # `fewness` of the training views
+) -> Tensor:  # [N] bool
+    """The anchors that stay: those worth their bits. What no view would miss goes, of the others at most half."""
+    price = bit_price(lmbda, len(bits)) * (1.0 - control.prune_less * few)
+    worth = control.prune_worth * changes / bits.double()
+    stays = changes > 0
+    most = int(MOST * stays.sum())
+    dear = torch.nonzero(stays & (worth < price)).view(-1)
+    stays[dear[torch.argsort(worth[dear], stable=True)[:most]]] = False
+    return stays
