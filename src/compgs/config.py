@@ -149,7 +149,7 @@ class ControlConfig:
     # of all blending weights in training views: what adds no more is left out of the file
     idle_share: Annotated[float, Range(0, 1, below=True)] = 0.002
     # of the steps: the anchors that are not worth their bits are removed
-    prune_at: Shares = (0.5, 0.6, 0.7)
+    prune_at: Shares = (0.3, 0.5, 0.6, 0.7)
     # what a mean squared change of the training views costs, in units of the loss, as pruning reckons
     # (`training/pruning.py`)
     prune_worth: Annotated[float, Range(0, 1e9, above=True, below=True)] = 20.0
