@@ -160,7 +160,7 @@ BITS = torch.tensor([50.0, 50.0, 50.0, 400.0, 50.0, 50.0, 50.0, 50.0])
         ),  # the fourth is worth more than the first two, but for its bits
         (1.27e-5, 0.0, [0, 0, 1, 0, 1, 0, 1, 1]),
         (1.27e-5, 1.0, [0, 1, 1, 1, 1, 0, 1, 1]),  # few views: a bit costs a quarter
-        (1.0, 0.0, [0, 0, 1, 0, 1, 0, 1, 1]),  # all are too dear: of those in view at most a third
+        (1.0, 0.0, [0, 0, 0, 0, 1, 0, 1, 1]),  # all are too dear: of those in view at most half
     ],
 )
 def test_those_stay_whose_worth_is_more_than_the_price_of_their_bits(
@@ -169,6 +169,37 @@ def test_those_stay_whose_worth_is_more_than_the_price_of_their_bits(
     """20 x change / bits is 4, 8, 2, 32, 40, 36 x 1e-8 of those in view; a bit costs lambda x 5 / 132 / 8."""
     control = ControlConfig(prune_worth=20.0, prune_less=0.75)
     assert paying(CHANGES, BITS, lmbda, control, few).int().tolist() == stays
+
+
+@pytest.mark.parametrize(
+    ("least_bits", "stays"),
+    [
+        (0.0, [0, 0, 1, 0, 1, 0, 1, 1]),  # 200 bits stay
+        (200.0, [0, 0, 1, 0, 1, 0, 1, 1]),
+        (201.0, [0, 1, 1, 0, 1, 0, 1, 1]),
+        (251.0, [0, 1, 1, 1, 1, 0, 1, 1]),
+        (1e6, [0, 1, 1, 1, 1, 0, 1, 1]),  # what no view shows does not help
+    ],
+)
+def test_of_those_that_do_not_pay_the_best_stay_while_the_file_would_be_too_small(
+    least_bits: float, stays: list[int]
+) -> None:
+    control = ControlConfig(prune_worth=20.0)
+    assert paying(CHANGES, BITS, 1.27e-5, control, 0.0, least_bits=least_bits).int().tolist() == stays
+
+
+@pytest.mark.parametrize(
+    ("prunings", "stays"),
+    [(1, [0, 0, 1, 0, 1, 0, 1, 1]), (3, [0, 0, 0, 0, 1, 0, 1, 1]), (60, [0, 0, 0, 0, 0, 0, 0, 1])],
+)
+def test_several_prunings_take_as_one_at_a_higher_price_but_each_at_most_half(
+    prunings: int, stays: list[int]
+) -> None:
+    """A bit costs 6 x 1e-8 in one pruning, 8.4 in three, 77 in sixty, and these leave no anchor but the best."""
+    control = ControlConfig(prune_worth=20.0)
+    changes = CHANGES.clone()
+    changes[7] = 1e-4
+    assert paying(changes, BITS, 1.27e-5, control, 0.0, prunings=prunings).int().tolist() == stays
 
 
 def test_pruning_takes_what_does_not_pay_by_the_bits_of_the_file(unequal: Trainer) -> None:

@@ -62,11 +62,14 @@ def test_lambda_moves_by_the_formula(
     after = follow(state, ratio * 5000, 5000, progress=progress, grown=grown)
     assert math.log(after.lmbda / 0.01) == pytest.approx(change)
     assert after.share == 0.7
+    # A twentieth of the way, in the logarithm: two hundredths of a run undo each other.
+    assert math.log(after.lmbda_of_pruning / 0.01) == pytest.approx(change / 20)
+    assert RateState(0.01).lmbda_of_pruning == 0.01
     assert after.error == (pytest.approx(math.log(ratio)) if grown else before)
 
 
 def test_the_share_that_is_left_is_that_of_all_prunings_to_come(blob_scene, tiny_config):
-    """Each further pruning counts as half a lambda more, and the file then has no idle primitives."""
+    """Each further pruning counts as a fifth of lambda more, and the file then has no idle primitives."""
     control = replace(tiny_config.control, prune_worth=20.0, idle_share=0.05)
     model = initial_model(blob_scene, replace(tiny_config, control=control))
     chance = torch.Generator().manual_seed(0)
@@ -87,7 +90,7 @@ def test_the_share_that_is_left_is_that_of_all_prunings_to_come(blob_scene, tiny
     idle = flat.values[int((flat.values.cumsum(0) < 0.95 * weights.sum()).sum())]
     before = latent_bytes(model)
     found = {}
-    for step, dearer in ((5, 1.5), (10, 1.5), (11, 1.0), (21, 0.0)):
+    for step, dearer in ((5, 1.2), (10, 1.2), (11, 1.0), (21, 0.0)):
         found[step] = size.lasting_share(lmbda, step)
         assert model.mask.all(), "the model is as it was"
         kept = worth >= lmbda * dearer * 5 / 132 / model.anchors
@@ -95,7 +98,7 @@ def test_the_share_that_is_left_is_that_of_all_prunings_to_come(blob_scene, tiny
         expected = latent_bytes(model) / before
         model.mask = torch.ones_like(model.mask)
         assert found[step] == pytest.approx(expected, rel=0.005), step
-    assert found[5] == found[10] < 0.9 * found[11] < 0.8 * found[21] < 0.8
+    assert found[5] == found[10] < 0.98 * found[11] < 0.8 * found[21] < 0.8
 
 
 @pytest.mark.parametrize(("target", "limit"), [(1e3, HIGHEST), (1e7, LOWEST)])

@@ -7,6 +7,9 @@ and weakly: it goes with lambda^-g, g being 0.1 to 0.3 once all has settled. The
 the run until the size is right, without overshoot for any such g. While anchors still grow, today's size says little
 about the last one, and lambda follows gently. Towards the end the embeddings hardly move any more, and a lambda that
 went on integrating would run away for nothing.
+
+Pruning cannot be taken back, and between two of them lambda swings by factors to make up for a few per cent. So pruning
+reckons with a lambda that follows slowly.
 """
 
 import math
@@ -22,6 +25,7 @@ SHRINKS = 0.1  # log of the share by which a file shrinks after growth at one la
 SETTLING = (2.0, 15.0)  # integral and proportional gain after growth
 SLOW_FROM = 0.92  # of the run: from here on the integral gain falls to zero at the end
 LARGEST_STEP = math.log(1.6)  # of log lambda at one estimate
+SLOWLY = 0.05  # of the way to lambda, in its logarithm, that `slow` goes at one estimate: a fifth of the run to follow
 
 
 @dataclass(frozen=True)
@@ -31,12 +35,18 @@ class RateState:
     lmbda: float
     error: float | None = None  # log(size / target) at the last estimate after growth; None before the first
     share: float = 1.0  # of the present bytes that later pruning will leave
+    slow: float | None = None  # lambda as pruning sees it; None: as it is
+
+    @property
+    def lmbda_of_pruning(self) -> float:
+        return self.lmbda if self.slow is None else self.slow
 
     @staticmethod
     def restored(values: dict[str, Any]) -> "RateState":
         """Of a checkpoint. Raises ValueError, TypeError for what is no state."""
         state = RateState(**values)
-        if not all(math.isfinite(number) for number in (state.lmbda, state.error or 0.0, state.share)):
+        numbers = (state.lmbda, state.error or 0.0, state.share, state.slow or 0.0)
+        if not all(math.isfinite(number) for number in numbers):
             raise ValueError(f"the state of lambda is not finite: {values}")
         return state
 
@@ -54,16 +64,18 @@ def follow(state: RateState, size: float, target: float, *, progress: float, gro
     """
     error = math.log(size / target)
     if not grown:
-        return replace(state, lmbda=_moved(state.lmbda, GROWING * (error - SHRINKS)))
+        return _moved(state, GROWING * (error - SHRINKS))
     integral, proportional = SETTLING
     if progress > SLOW_FROM:
         integral *= (1.0 - progress) / (1.0 - SLOW_FROM)
     change = integral * error
     if state.error is not None:
         change += proportional * (error - state.error)
-    return replace(state, lmbda=_moved(state.lmbda, change), error=error)
+    return replace(_moved(state, change), error=error)
 
 
-def _moved(lmbda: float, change: float) -> float:
+def _moved(state: RateState, change: float) -> RateState:
     change = min(max(change, -LARGEST_STEP), LARGEST_STEP)
-    return min(max(lmbda * math.exp(change), LOWEST), HIGHEST)
+    lmbda = min(max(state.lmbda * math.exp(change), LOWEST), HIGHEST)
+    slow = max(state.lmbda_of_pruning, LOWEST)
+    return replace(state, lmbda=lmbda, slow=slow * (lmbda / slow) ** SLOWLY)

@@ -15,7 +15,6 @@ from compgs.training.pruning import paying
 from compgs.training.rate_control import LOOKS, RateState, due, follow
 
 SHARES = 10  # times in a run that the effect of later pruning is predicted
-LATER = 0.5  # by which each further pruning is as if lambda were higher, about (plush_480, fox; 1 500 steps)
 
 
 class TargetSize:
@@ -58,9 +57,14 @@ class TargetSize:
             raise TrainingError(f"step {step}: the rate is {size}; try a lower learning rate or another seed")
         pruned = any(step - t.steps // LOOKS <= at < step for at in self.pruned_at)
         if pruned or step % max(1, t.steps // SHARES) == 0 or (grown and state.error is None):
-            state = replace(state, share=self.lasting_share(state.lmbda, step))
+            state = replace(state, share=self.lasting_share(state.lmbda_of_pruning, step))
         target = max(1, t.target_bytes - fixed)
         return follow(state, size * state.share, target, progress=step / t.steps, grown=grown)
+
+    def least_bits(self) -> float:
+        """Of latents and positions, that pruning leaves: with fewer no lambda would bring the file to its size."""
+        target = self.config.training.target_bytes
+        return 0.0 if target is None else 8.0 * (target - fixed_bytes(self.model))
 
     def size(self, mask: Tensor | None = None) -> float:
         """Bytes of the file that depend on lambda: latents and positions, without the networks. `mask`: [N, K] bool, of
@@ -80,8 +84,6 @@ class TargetSize:
         return self.size(lasting) / size if lasting.any() else 1.0
 
     def lasting_anchors(self, lmbda: float, still: int) -> Tensor:
-        """[N] bool: those that outlast so many prunings. One after the other takes what a single one would at a higher
-        price: by then the others have taken over.
-        """
-        dearer = lmbda * (1.0 + LATER * (still - 1))
-        return paying(self.changes(), anchor_bits(self.model), dearer, self.config.control, self.few)
+        """[N] bool: those that outlast so many prunings."""
+        bits = anchor_bits(self.model)
+        return paying(self.changes(), bits, lmbda, self.config.control, self.few, prunings=still)

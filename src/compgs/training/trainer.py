@@ -410,7 +410,8 @@ class Trainer:
     def prune(self) -> None:
         """Remove the anchors that are not worth their bits: what is left of the run makes up for them."""
         changes, bits = self.changes(PRUNED_BY), anchor_bits(self.model)
-        kept = paying(changes, bits, self.rate.lmbda, self.config.control, self.few)
+        lmbda, least = self.rate.lmbda_of_pruning, self.target_size.least_bits()
+        kept = paying(changes, bits, lmbda, self.config.control, self.few, least_bits=least)
         if kept.any():
             self.control.keep(self.model, self.optimizer, kept)
 
