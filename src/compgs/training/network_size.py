@@ -7,8 +7,8 @@ weights cost less than they save. Where anchors are many, or bits cheap, nothing
 
 from compgs.config import Config
 
-# Hidden units from a price of a bit on, lambda / N as the run starts (docs/log/2026-11-23-13-networks.md).
-WIDTHS = ((1.5e-6, 24), (3.5e-6, 16), (1.3e-5, 8))
+# Hidden units from a price of a bit on, lambda / N as the run starts (docs/log/2026-11-23-14-pruning.md).
+WIDTHS = ((6e-7, 24), (1e-6, 16), (1.5e-6, 8))
 # And up to a size of the file, where one is asked for.
 WIDTHS_OF_SIZES = ((26_000, 24), (18_000, 16), (9_000, 8))
 # Bits by which weights are shorter, from a price on, lambda / N of the anchors that there are in the end.
