@@ -25,8 +25,12 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 def trained(scene: Scene, config: Config, steps: int = 12, **entropy: object) -> Trainer:
-    """A short run without turns, on latents whose channels have much in common."""
-    config = replace(config, entropy=replace(config.entropy, decorrelate_at=(), **entropy))
+    """A short run without turns and prunings, on latents whose channels have much in common."""
+    config = replace(
+        config,
+        entropy=replace(config.entropy, decorrelate_at=(), **entropy),
+        control=replace(config.control, prune_at=()),
+    )
     trainer = Trainer(scene, config, CPU)
     references = trainer.model.references
     generator = torch.Generator().manual_seed(5)
