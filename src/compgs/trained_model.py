@@ -108,10 +108,16 @@ class TrainedModel(nn.Module):
         *,
         reference_dim: int | None = None,  # None: that of the settings
         width: int | None = None,  # hidden units of the prediction networks; None: those of the settings
+        residuals: bool | None = None,  # whether each anchor has its own; None: as the settings say
     ) -> None:
         super().__init__()
         m = config.model
-        m = replace(m, reference_dim=reference_dim or m.reference_dim, width=width or m.width)
+        m = replace(
+            m,
+            reference_dim=reference_dim or m.reference_dim,
+            width=width or m.width,
+            residuals=m.residuals if residuals is None else residuals,
+        )
         n = len(coordinates)
         self.config = config
         self.voxel_size = voxel_size
@@ -145,6 +151,11 @@ class TrainedModel(nn.Module):
     def reference_dim(self) -> int:
         """Channels of the references now: those that came to say nothing are gone."""
         return self.references.shape[1]
+
+    @property
+    def own_residuals(self) -> bool:
+        """Whether each anchor has its own residual embeddings."""
+        return isinstance(self.residual_kind, OwnResiduals)
 
     @property
     def dimensions(self) -> ModelDimensions:

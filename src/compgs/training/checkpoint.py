@@ -108,6 +108,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, writer: Writer | None = 
                 "up": list(model.up),
                 "world_offset": list(model.world_offset),
                 "width": model.dimensions.width,
+                "residuals": model.own_residuals,
                 "head_bits": model.head_bits,
             }
         ),
@@ -174,6 +175,9 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     red, green, blue = finite(scene["background"], 3, "background")
     x, y, z = finite(scene["world_offset"], 3, "world_offset")
     width = whole_number(scene["width"], 1, config.model.width, "width")
+    residuals = scene["residuals"]
+    if not isinstance(residuals, bool):
+        raise ValueError(f"residuals: expected true or false, found {residuals!r}")
     model = TrainedModel(
         config,
         coordinates,
@@ -183,6 +187,7 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
         (x, y, z),
         reference_dim=references.shape[1],
         width=width,
+        residuals=residuals,
     )
     model.head_bits = whole_number(scene["head_bits"], 1, config.entropy.head_bits, "head_bits")
     model.viewpoints = tuple(_camera(entry) for entry in scene["viewpoints"])

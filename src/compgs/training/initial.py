@@ -11,6 +11,7 @@ from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
+from compgs.training.few_views import own_residuals
 from compgs.training.network_size import head_bits, hidden_width
 
 COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
@@ -38,6 +39,7 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
             scene.background,
             offset,
             width=hidden_width(config, len(coordinates)),
+            residuals=own_residuals(config, len(coordinates), len(cameras)),
         )
     model.head_bits = head_bits(config, config.training.lmbda, model.anchors)
     with torch.no_grad():
