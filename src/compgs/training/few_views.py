@@ -4,7 +4,7 @@ from compgs.config import Config
 
 FEW_VIEWS = 15  # and fewer are few; twice as many are not any more
 # Bytes for each anchor of the beginning, from which on own residual embeddings are worth theirs in a file of a size
-# that is asked for: of 10 to 19 where they were, with lambda 0.002 and 0.001 (docs/log/2026-11-23-15-residuals.md)
+# that is asked for: 10 to 19 where they were, with lambda 0.001 (docs/log/2026-11-23-15-residuals.md)
 BYTES_FOR_RESIDUALS = 12
 
 
