@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from compgs.cameras import Camera
-from compgs.config import Config
+from compgs.config import Config, ModelConfig
 from compgs.devices import placed
 from compgs.entropy.models import Quantized, make_entropy_model
 from compgs.model.constants import SHARED_RESIDUALS
@@ -105,19 +105,11 @@ class TrainedModel(nn.Module):
         distance_unit: float,  # world units, of the view embedding
         background: tuple[float, float, float],
         world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),  # world units, float64
-        *,
-        reference_dim: int | None = None,  # None: that of the settings
-        width: int | None = None,  # hidden units of the prediction networks; None: those of the settings
-        residuals: bool | None = None,  # whether each anchor has its own; None: as the settings say
+        made: ModelConfig
+        | None = None,  # what training decides that the settings leave to it; None: as they say
     ) -> None:
         super().__init__()
-        m = config.model
-        m = replace(
-            m,
-            reference_dim=reference_dim or m.reference_dim,
-            width=width or m.width,
-            residuals=m.residuals if residuals is None else residuals,
-        )
+        m = made or config.model
         n = len(coordinates)
         self.config = config
         self.voxel_size = voxel_size

@@ -5,7 +5,7 @@ Tensors by name; settings, counters and the view order as JSON in the file's met
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -178,6 +178,7 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     residuals = scene["residuals"]
     if not isinstance(residuals, bool):
         raise ValueError(f"residuals: expected true or false, found {residuals!r}")
+    made = replace(config.model, reference_dim=references.shape[1], width=width, residuals=residuals)
     model = TrainedModel(
         config,
         coordinates,
@@ -185,9 +186,7 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
         distance_unit,
         (red, green, blue),
         (x, y, z),
-        reference_dim=references.shape[1],
-        width=width,
-        residuals=residuals,
+        made,
     )
     model.head_bits = whole_number(scene["head_bits"], 1, config.entropy.head_bits, "head_bits")
     model.viewpoints = tuple(_camera(entry) for entry in scene["viewpoints"])

@@ -1,5 +1,7 @@
 """The model that training starts from."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -11,8 +13,8 @@ from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
-from compgs.training.few_views import own_residuals
 from compgs.training.network_size import head_bits, hidden_width
+from compgs.training.own_residuals import own_residuals
 
 COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
 
@@ -38,8 +40,7 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
             scene.extent,
             scene.background,
             offset,
-            width=hidden_width(config, len(coordinates)),
-            residuals=own_residuals(config, len(coordinates), len(cameras)),
+            made_for(config, len(coordinates), len(cameras)),
         )
     model.head_bits = head_bits(config, config.training.lmbda, model.anchors)
     with torch.no_grad():
@@ -55,6 +56,15 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
         model.viewpoints = tuple(cameras[i] for i in choose_viewpoints(cameras, MAX_VIEWPOINTS))
         model.up = up_direction(cameras)
     return model
+
+
+def made_for(config: Config, anchors: int, views: int) -> ModelConfig:
+    """The model of a run that starts with so many anchors, of what the settings leave to training."""
+    return replace(
+        config.model,
+        width=hidden_width(config, anchors),
+        residuals=own_residuals(config, anchors, views),
+    )
 
 
 def anchor_grid(scene: Scene, m: ModelConfig) -> tuple[np.ndarray, float]:

@@ -1,0 +1,54 @@
+"""Residual embeddings of their own."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from compgs.codec import encode
+from compgs.config import Config, load_config
+from compgs.scene.views import Scene
+from compgs.training.checkpoint import load_checkpoint
+from compgs.training.own_residuals import own_residuals
+from compgs.training.trainer import train
+
+
+def asked(**training: object) -> Config:
+    return replace(Config(), training=replace(Config().training, **training))
+
+
+def test_anchors_have_their_own_residuals_where_few_views_look_and_bits_are_cheap() -> None:
+    cheap, dear = asked(lmbda=0.001), asked(lmbda=0.005)
+    assert [own_residuals(cheap, 2000, views) for views in (12, 22, 23, 100)] == [True, True, False, False]
+    assert not own_residuals(dear, 2000, 12)
+    assert own_residuals(load_config("paper"), 2000, 100), "as published"
+
+
+def test_a_size_that_is_asked_for_decides_by_its_bytes_for_an_anchor() -> None:
+    large, small = asked(target_bytes=24_000, lmbda=1.0), asked(target_bytes=23_999, lmbda=0.0)
+    assert own_residuals(large, 2000, 12) and not own_residuals(small, 2000, 12)
+
+
+@pytest.mark.parametrize("training", [{"lmbda": 0.0}, {"target_bytes": 10**9}])
+def test_a_limit_of_zero_keeps_residuals_shared(training: dict[str, float]) -> None:
+    config = asked(**training)
+    config = replace(config, model=replace(config.model, residuals_where_few=0.0))
+    assert not own_residuals(config, 2000, 12)
+
+
+def test_a_run_with_few_views_trains_encodes_and_resumes_with_residuals_of_its_own(
+    blob_scene: Scene, tiny_config: Config, tmp_path: Path
+) -> None:
+    model = replace(tiny_config.model, residuals=False, residuals_where_few=0.002)
+    config = replace(tiny_config, model=model, training=replace(tiny_config.training, steps=4, lmbda=0.001))
+    assert len(blob_scene.train_views) <= 22
+    trained = train(blob_scene, config, output=tmp_path, device="cpu")
+    assert trained.own_residuals and len(trained.residuals) == trained.anchors
+    restored = load_checkpoint(tmp_path / "checkpoint.safetensors").model
+    assert restored.own_residuals and torch.equal(restored.residuals, trained.residuals)
+    encode(trained, tmp_path / "a.cgs")
+    encode(restored, tmp_path / "b.cgs")
+    assert (tmp_path / "a.cgs").read_bytes() == (tmp_path / "b.cgs").read_bytes()
+    shared = train(blob_scene, replace(config, training=replace(config.training, lmbda=0.003)), device="cpu")
+    assert not shared.own_residuals and len(shared.residuals) == 1
