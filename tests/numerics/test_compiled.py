@@ -13,7 +13,7 @@ from compgs.cli import compiling as announcing
 from compgs.numerics import kernel_cache
 from compgs.numerics.compiled import njit, portion
 from compgs.numerics.compiling import COMPILING, CompilingTime, working_seconds
-from compgs.numerics.crew import Crew, Share
+from compgs.numerics.crew import CREW, Crew, Share
 
 
 @pytest.fixture(autouse=True)
@@ -145,6 +145,52 @@ def test_an_error_in_any_share_reaches_the_caller_when_all_shares_have_ended() -
         with pytest.raises(ValueError, match=f"share {failing}"):
             Crew().do(work, 3)
         assert sorted(ended) == [i for i in range(3) if i != failing]
+
+
+@pytest.mark.parametrize("failing", [(0, 1, 2), (1, 2), (2,)])
+def test_of_several_errors_the_caller_gets_that_of_the_first_share(failing: tuple[int, ...]) -> None:
+    def work(share: Share) -> None:
+        time.sleep(0.02 * (3 - share[0]))  # the last fails first
+        if share[0] in failing:
+            raise ValueError(f"share {share[0]}")
+
+    with pytest.raises(ValueError, match=f"share {failing[0]}"):
+        Crew().do(work, 3)
+
+
+def test_two_tasks_meet_on_two_threads(threads: int) -> None:
+    meeting = threading.Barrier(2, timeout=20)
+    assert sorted(Crew().both(meeting.wait, meeting.wait)) == [0, 1]
+
+
+def test_on_one_thread_two_tasks_come_one_after_the_other_and_an_error_ends_both(threads: int) -> None:
+    came: list[int] = []
+    numba.set_num_threads(1)  # (`threads` sets it back)
+    Crew().both(lambda: came.append(threading.get_ident()), lambda: came.append(threading.get_ident()))
+    assert came == [threading.get_ident()] * 2
+    with pytest.raises(ZeroDivisionError):
+        Crew().both(lambda: 1 // 0, lambda: came.append(0))
+    assert len(came) == 2
+
+
+def test_tasks_of_a_crew_may_call_parallel_kernels(threads: int) -> None:
+    """Members share nothing further: as many tasks as members, each waiting for another, would never end."""
+    first, second = CREW.both(lambda: filled(100), lambda: filled(100))
+    assert first.tolist() == filled(100).tolist() and second.tolist() == [10] * 100
+
+
+@njit(parallel=True, worth=lambda out: len(out) // 4)
+def fill_large(out, share):
+    for i in portion(len(out), share):
+        out[i] += 10 * share[1] + share[0]
+
+
+def test_a_call_that_is_not_worth_it_is_not_shared(threads: int) -> None:
+    small, large = np.zeros(7, np.int64), np.zeros(4 * threads, np.int64)
+    fill_large(small)
+    fill_large(large)
+    assert small.tolist() == [10] * 7
+    assert large.tolist() == (10 * threads + np.arange(threads).repeat(4)).tolist()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system does not fork")

@@ -218,7 +218,11 @@ def scatter_existing(existing: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [
     return slots
 
 
-@njit(parallel=True)
+def _additions_worth_sharing(symbols: np.ndarray, means: np.ndarray) -> int:
+    return symbols.size >> 17  # 30 microseconds
+
+
+@njit(parallel=True, worth=_additions_worth_sharing)
 def _add_steps(symbols, means, share):
     for i in portion(len(symbols), share):
         means[i] += symbols[i] << FRACTION_BITS

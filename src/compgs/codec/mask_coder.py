@@ -36,7 +36,7 @@ MIXING_RATE = 2  # in 2**-16
 INITIAL_WEIGHT = 3 * WEIGHT_ONE // 8
 
 
-@njit
+@njit(nogil=True)
 def _walk(
     coder: NDArray[np.int64],
     data: NDArray[np.uint8],
@@ -109,7 +109,7 @@ def decode_masks(data: bytes, anchors: int, coupled: int) -> NDArray[np.bool_]:
     """Payload -> [anchors, coupled]. Inverse of `encode_masks`.
 
     Raises CorruptSection for anything that it would not have written. Takes time and memory in proportion to
-    anchors * coupled, which the caller has bounded: positions come first and prove the number of anchors.
+    anchors * coupled, which the caller has bounded.
     """
     if not (0 <= anchors <= MAXIMUM_ANCHORS and 0 <= coupled <= MAXIMUM_COUPLED):
         raise CorruptSection(

@@ -314,7 +314,7 @@ class Frontier(NamedTuple):
     family: NDArray[np.int16]  # occupancy of its parent's children | own child index << 8
 
 
-@njit
+@njit(nogil=True)
 def _walk(
     coder: NDArray[np.int64],
     data: NDArray[np.uint8],

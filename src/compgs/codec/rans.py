@@ -10,6 +10,8 @@ depend on how many there are.
     last, words read forwards, and it must end in the initial states
 """
 
+from typing import Any
+
 import numpy as np
 
 from compgs.codec.fields import FieldReader, varint
@@ -199,7 +201,12 @@ def _encode_chunk(symbols, index, lowest, counts, offsets, cumulative, words):
     return position, escapes
 
 
-@njit(parallel=True)
+def _chunks(*arguments: Any) -> int:
+    """Of a call of the two kernels below."""
+    return len(arguments[-1])
+
+
+@njit(parallel=True, worth=_chunks)
 def _encode_chunks(symbols, index, lowest, counts, offsets, cumulative, words, first, escapes, share):
     for c in portion(len(first), share):
         start = c * CHUNK_SYMBOLS
@@ -261,7 +268,7 @@ def _decode_chunk(words, begin, end, index, lowest, counts, offsets, cumulative,
     return escapes
 
 
-@njit(parallel=True)
+@njit(parallel=True, worth=_chunks)
 def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, lookup, symbols, escapes, share):
     for c in portion(len(escapes), share):
         start = c * CHUNK_SYMBOLS

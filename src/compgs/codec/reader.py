@@ -45,6 +45,7 @@ from compgs.codec.tmc3 import decode_positions_tmc3
 from compgs.codec.viewpoints import decode_viewpoints
 from compgs.codec.weights import decode_heads, decode_networks
 from compgs.errors import CorruptSection
+from compgs.numerics.crew import CREW
 
 
 @dataclass(frozen=True)
@@ -157,11 +158,12 @@ def read_latents(
         by_number[HEADS], SECTION_NAMES[HEADS], partial(check_products, HEAD_PRODUCTS, coupled, HEADS)
     )
     priors = _priors(d, iter(networks), iter(tables))
-    if POSITIONS in by_number:
-        coordinates = decode_positions(by_number[POSITIONS], scene.anchors)
+    read_positions = partial(_positions, by_number, scene.anchors)
+    read_masks = partial(decode_masks, by_number[MASKS], scene.anchors, d.coupled_primitives)
+    if prefix:  # only the positions prove that there are so many anchors
+        coordinates, mask = read_positions(), read_masks()
     else:
-        coordinates = decode_positions_tmc3(by_number[POSITIONS_GPCC], scene.anchors)
-    mask = decode_masks(by_number[MASKS], scene.anchors, d.coupled_primitives)
+        coordinates, mask = CREW.both(read_positions, read_masks)
     if int(mask.sum()) != scene.coupled:
         raise CorruptSection(
             f"masks: {int(mask.sum())} coupled primitives exist, the scene section promises {scene.coupled}"
@@ -191,6 +193,12 @@ def read_latents(
         metadata=metadata,
     )
     return content, latents
+
+
+def _positions(sections: dict[int, bytes], anchors: int) -> np.ndarray:  # [N, 3] int32
+    if POSITIONS in sections:
+        return decode_positions(sections[POSITIONS], anchors)
+    return decode_positions_tmc3(sections[POSITIONS_GPCC], anchors)
 
 
 def _priors(d: Dimensions, networks: Iterator, tables: Iterator) -> list[Prior]:

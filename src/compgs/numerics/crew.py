@@ -9,7 +9,12 @@ import os
 import threading
 from collections.abc import Callable
 from queue import SimpleQueue
+from typing import TypeVar
 
+import numba
+
+A = TypeVar("A")
+B = TypeVar("B")
 Share = tuple[int, int]  # (which, of how many)
 ALL: Share = (0, 1)
 
@@ -27,17 +32,44 @@ class Crew:
         self._hiring = threading.Lock()
 
     def do(self, work: Callable[[Share], None], count: int) -> None:
-        """`work((i, count))` for each i below count, at the same time. Raises what a share raised, once all ended."""
+        """`work((i, count))` for each i below count, at the same time. Raises what the first of those raised that did,
+        once all ended.
+        """
         self._grow(count - 1)
-        done: SimpleQueue[BaseException | None] = SimpleQueue()
+        done: SimpleQueue[tuple[int, BaseException | None]] = SimpleQueue()
         for i in range(1, count):
             self._work.put((work, (i, count), done))
-        error = _attempt(work, (0, count))
+        errors: list[BaseException | None] = [None] * (1 + count)
+        errors[1] = _attempt(work, (0, count))
         for _ in range(1, count):
             # Kernels cannot be stopped: Ctrl-C, too, waits for those that write into the caller's arrays.
-            error = _take(done) or error
-        if error is not None:
-            raise error
+            try:
+                i, error = done.get()
+            except KeyboardInterrupt as stop:
+                errors[0] = stop
+                i, error = done.get()
+            errors[1 + i] = error
+        for error in errors:
+            if error is not None:
+                raise error
+
+    def both(self, first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
+        """What they return, computed at the same time if there is a thread for each. Raises what the first raised, else
+        what the second did.
+        """
+        if numba.get_num_threads() == 1:
+            return first(), second()
+        of_first: list[A] = []
+        of_second: list[B] = []
+
+        def work(share: Share) -> None:
+            if share[0] == 0:
+                of_first.append(first())
+            else:
+                of_second.append(second())
+
+        self.do(work, 2)
+        return of_first[0], of_second[0]
 
     def _grow(self, members: int) -> None:
         if self._members < members:
@@ -48,9 +80,12 @@ class Crew:
                     self._members += 1
 
     def _serve(self) -> None:
+        numba.set_num_threads(
+            1
+        )  # of this thread: it shares nothing further, or all might wait for each other
         while True:
             work, share, done = self._work.get()
-            done.put(_attempt(work, share))
+            done.put((share[0], _attempt(work, share)))
             del work, done  # the caller's arrays are not held until the next task
 
 
@@ -63,14 +98,6 @@ def _attempt(work: Callable[[Share], None], share: Share) -> BaseException | Non
     except BaseException as error:
         return error
     return None
-
-
-def _take(done: "SimpleQueue[BaseException | None]") -> BaseException | None:
-    """What a share raised; an interruption that comes meanwhile, once the share ended."""
-    try:
-        return done.get()
-    except KeyboardInterrupt as stop:
-        return done.get() or stop
 
 
 CREW = Crew()
