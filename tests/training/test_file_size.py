@@ -11,7 +11,7 @@ from compgs.codec.writer import write_content
 from compgs.config import Config
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
-from compgs.training.file_size import fixed_bytes, latent_bytes
+from compgs.training.file_size import FileSize, fixed_bytes
 from compgs.training.initial import initial_model
 
 
@@ -26,11 +26,33 @@ def model(blob_scene: Scene, tiny_config: Config) -> TrainedModel:
     return result
 
 
-def test_an_anchor_that_has_primitives_left_takes_ten_bits_for_its_position(model: TrainedModel) -> None:
-    left = int(model.mask.any(1).sum())
-    assert left < model.anchors
-    bits = sum(model.estimated_bits().values())
-    assert latent_bytes(model) == pytest.approx((bits + 10 * left) / 8)
+def written(model: TrainedModel) -> dict[str, int]:
+    """Bytes of the file's sections, by name."""
+    return {section.name: section.bytes for section in file_info(write_content(to_content(model))).sections}
+
+
+def test_positions_and_masks_take_what_their_coders_say(model: TrainedModel) -> None:
+    assert int(model.mask.any(1).sum()) < model.anchors
+    latents = sum(model.estimated_bits().values()) / 8
+    sections = written(model)
+    assert FileSize(model).latents() == pytest.approx(
+        latents + sections["positions"] + sections["masks"], abs=0.01
+    )
+
+
+def test_positions_are_coded_anew_where_anchors_change(model: TrainedModel) -> None:
+    model.mask = torch.ones_like(model.mask)
+    size = FileSize(model)
+    before = size.latents()
+    assert size.latents() == before
+    bits = sum(model.estimated_bits().values()) / 8
+    model.coordinates = model.coordinates * 7  # no grid that the coder knows
+    assert size.latents() == pytest.approx(bits + written(model)["positions"], abs=0.01)
+    assert size.latents() > before
+
+
+def test_without_primitives_there_is_nothing(model: TrainedModel) -> None:
+    assert FileSize(model).latents(torch.zeros_like(model.mask)) == 0
 
 
 def test_the_cameras_that_a_file_keeps_are_counted(model: TrainedModel) -> None:
@@ -45,6 +67,5 @@ def test_the_cameras_that_a_file_keeps_are_counted(model: TrainedModel) -> None:
 
 
 def test_the_networks_take_about_what_they_are_said_to(model: TrainedModel) -> None:
-    written = {s.name: s.bytes for s in file_info(write_content(to_content(model))).sections}
-    networks = sum(count for name, count in written.items() if "heads" in name or "networks" in name)
+    networks = sum(count for name, count in written(model).items() if "heads" in name or "networks" in name)
     assert fixed_bytes(model) == pytest.approx(networks + 600, rel=0.1)

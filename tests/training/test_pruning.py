@@ -189,6 +189,23 @@ def test_of_those_that_do_not_pay_the_best_stay_while_the_file_would_be_too_smal
 
 
 @pytest.mark.parametrize(
+    ("most_bits", "stays"),
+    [
+        (650.0, [0, 1, 1, 1, 1, 0, 1, 1]),  # at no price all that a view would miss stay
+        (649.0, [0, 1, 1, 0, 1, 0, 1, 1]),
+        (250.0, [0, 1, 1, 0, 1, 0, 1, 1]),
+        (249.0, [0, 0, 1, 0, 1, 0, 1, 1]),
+        (1.0, [0, 0, 0, 0, 1, 0, 1, 1]),  # at most half of them go
+    ],
+)
+def test_where_the_file_would_be_too_large_those_go_that_are_worth_least(
+    most_bits: float, stays: list[int]
+) -> None:
+    control = ControlConfig(prune_worth=20.0)
+    assert paying(CHANGES, BITS, 0.0, control, 0.0, most_bits=most_bits).int().tolist() == stays
+
+
+@pytest.mark.parametrize(
     ("prunings", "stays"),
     [(1, [0, 0, 1, 0, 1, 0, 1, 1]), (3, [0, 0, 0, 0, 1, 0, 1, 1]), (60, [0, 0, 0, 0, 0, 0, 0, 1])],
 )

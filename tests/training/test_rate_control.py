@@ -9,7 +9,7 @@ import torch
 from compgs.codec import encode
 from compgs.errors import ConfigError
 from compgs.training.control import make_schedule
-from compgs.training.file_size import latent_bytes
+from compgs.training.file_size import FileSize
 from compgs.training.initial import initial_model
 from compgs.training.rate_control import HIGHEST, LOWEST, RateState, due, follow
 from compgs.training.target_size import TargetSize
@@ -88,14 +88,14 @@ def test_the_share_that_is_left_is_that_of_all_prunings_to_come(blob_scene, tiny
     lmbda = float(ascending[0] + ascending[1]) / 2 * model.anchors * 132 / 5
     flat = weights.view(-1).sort(descending=True)
     idle = flat.values[int((flat.values.cumsum(0) < 0.95 * weights.sum()).sum())]
-    before = latent_bytes(model)
+    before = FileSize(model).latents()
     found = {}
     for step, dearer in ((5, 1.2), (10, 1.2), (11, 1.0), (21, 0.0)):
         found[step] = size.lasting_share(lmbda, step)
         assert model.mask.all(), "the model is as it was"
         kept = worth >= lmbda * dearer * 5 / 132 / model.anchors
         model.mask = kept[:, None] & (weights >= idle)
-        expected = latent_bytes(model) / before
+        expected = FileSize(model).latents() / before
         model.mask = torch.ones_like(model.mask)
         assert found[step] == pytest.approx(expected, rel=0.005), step
     assert found[5] == found[10] < 0.98 * found[11] < 0.8 * found[21] < 0.8

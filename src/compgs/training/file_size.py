@@ -2,24 +2,60 @@
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from compgs.codec.anchor_order import canonical_order
+from compgs.codec.mask_coder import encode_masks
+from compgs.codec.octree import encode_positions
 from compgs.entropy.network import FRACTION_BITS
 from compgs.entropy.quantization import weight_exponent
 from compgs.trained_model import TrainedModel
 
-POSITION_BITS = 10.0  # of an anchor's position, about
+POSITION_BITS = 10.0  # that one anchor less saves of the positions, about
 OTHER_BYTES = 600  # names of tensors, scene, tables, metadata, container, about
 LENS_BYTES, VIEWPOINT_BYTES = 32, 13  # of the cameras that the file keeps
 
 
-def latent_bytes(model: TrainedModel, mask: Tensor | None = None) -> float:
-    """Bytes of latents and positions, if the coupled primitives of `mask` [N, K] bool existed (default: those that do);
-    not finite if the latents are not.
-    """
-    anchors = int((model.mask if mask is None else mask).any(1).sum())
-    return (sum(model.estimated_bits(mask).values()) + POSITION_BITS * anchors) / 8
+class FileSize:
+    """Bytes of a model in training. Remembers what the positions take while anchors stay the same."""
+
+    def __init__(self, model: TrainedModel) -> None:
+        self.model = model
+        self._coordinates: Tensor | None = None
+        self._positions = 0
+
+    def latents(self, mask: Tensor | None = None) -> float:
+        """Bytes of latents, positions and masks, if the coupled primitives of `mask` [N, K] bool existed (default:
+        those that do); not finite if the latents are not.
+        """
+        mask = self.model.mask if mask is None else mask
+        return sum(self.model.estimated_bits(mask).values()) / 8 + self._geometry(mask)
+
+    def _geometry(self, mask: Tensor) -> int:
+        """Bytes of positions and masks."""
+        if not mask.all():
+            return geometry_bytes(self.model.coordinates, mask)
+        if self._coordinates is not self.model.coordinates:
+            self._coordinates, self._positions = (
+                self.model.coordinates,
+                geometry_bytes(self.model.coordinates, mask),
+            )
+        return self._positions
+
+
+def geometry_bytes(
+    coordinates: Tensor,  # [N, 3] int32
+    mask: Tensor,  # [N, K] bool; anchors without any are left out
+) -> int:
+    """Bytes of positions and masks, by their coders."""
+    kept = mask.any(1)
+    places, exist = coordinates[kept].cpu().numpy(), mask[kept].cpu().numpy()
+    if len(places) == 0:
+        return 0
+    masks = 0 if exist.all() else len(encode_masks(np.ascontiguousarray(exist[canonical_order(places)])))
+    return len(encode_positions(places)) + masks
 
 
 def anchor_bits(model: TrainedModel) -> Tensor:

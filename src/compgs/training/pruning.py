@@ -11,6 +11,7 @@ one draw of signs. Blending weights (`importance.py`) would be as cheap, but an 
 has large ones, and nobody would miss it.
 """
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -76,17 +77,20 @@ def paying(
     few: float,  # `fewness` of the training views
     *,
     least_bits: float = 0.0,
+    most_bits: float = math.inf,
     prunings: int = 1,  # foreseen: how many there are, one after the other
 ) -> Tensor:  # [N] bool
     """The anchors that stay: those worth their bits, and of the others the best while all that stay have fewer bits
-    than `least_bits`. What no view would miss goes, of the rest at most half in a pruning.
+    than `least_bits`; if they have more than `most_bits`, the best. What no view would miss goes, of the rest at most
+    half in a pruning.
     """
     price = bit_price(lmbda, len(bits)) * (1.0 - control.prune_less * few) * (1.0 + LATER * (prunings - 1))
     worth = control.prune_worth * changes / bits.double()
     stays = changes > 0
     most = int((1.0 - (1.0 - MOST) ** prunings) * stays.sum())
-    dear = torch.nonzero(stays & (worth < price)).view(-1)
-    dear = dear[torch.argsort(worth[dear], stable=True)[:most]]
-    left = (bits * stays).sum() - bits[dear].cumsum(0)
-    stays[dear[left >= least_bits]] = False
+    worst = torch.nonzero(stays).view(-1)
+    worst = worst[torch.argsort(worth[worst], stable=True)[:most]]
+    with_it = (bits * stays).sum() - bits[worst].cumsum(0) + bits[worst]
+    goes = (worth[worst] < price) & (with_it - bits[worst] >= least_bits) | (with_it > most_bits)
+    stays[worst[goes]] = False
     return stays

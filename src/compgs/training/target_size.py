@@ -4,16 +4,20 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from compgs.errors import ConfigError, TrainingError
 from compgs.trained_model import TrainedModel
 from compgs.training.control import ControlSchedule
-from compgs.training.file_size import anchor_bits, fixed_bytes, latent_bytes
+from compgs.training.file_size import FileSize, anchor_bits, fixed_bytes
 from compgs.training.importance import missed
 from compgs.training.pruning import paying
 from compgs.training.rate_control import LOOKS, RateState, due, follow
 
+SETTLES = (
+    1.03  # as large files may be after the last pruning: they come down by that in what is left of a run
+)
 SHARES = 10  # times in a run that the effect of later pruning is predicted
 
 
@@ -36,6 +40,7 @@ class TargetSize:
         self.contributions = contributions
         self.changes = changes
         self.few = few
+        self.file = FileSize(model)
         target, least = self.config.training.target_bytes, fixed_bytes(model)
         if target is not None and target <= least:
             raise ConfigError(
@@ -61,27 +66,32 @@ class TargetSize:
         target = max(1, t.target_bytes - fixed)
         return follow(state, size * state.share, target, progress=step / t.steps, grown=grown)
 
-    def least_bits(self) -> float:
-        """Of latents and positions, that pruning leaves: with fewer no lambda would bring the file to its size."""
+    def bits_that_stay(self, step: int, bits: Tensor) -> tuple[float, float]:
+        """Of all `bits` [N] of the anchors, after a pruning at this step: with fewer than the first no lambda would
+        bring the file to its size, and with more than the second after the last pruning none would in time.
+        """
         target = self.config.training.target_bytes
-        return 0.0 if target is None else 8.0 * (target - fixed_bytes(self.model))
+        if target is None:
+            return 0.0, math.inf
+        drawn = missed(self.contributions(), self.config.control.idle_share)
+        share = (target - fixed_bytes(self.model)) / max(1.0, self.size(drawn))
+        wanted = share * float(bits.sum(dtype=torch.float64))
+        return wanted, SETTLES * wanted if step == max(self.pruned_at) else math.inf
 
     def size(self, mask: Tensor | None = None) -> float:
-        """Bytes of the file that depend on lambda: latents and positions, without the networks. `mask`: [N, K] bool, of
-        the coupled primitives that are to exist; default: those that do.
+        """Bytes of the file that depend on lambda, without the networks. `mask`: [N, K] bool, of the coupled primitives
+        that are to exist; default: those that do.
         """
-        found = latent_bytes(self.model, mask)
+        found = self.file.latents(mask)
         return math.floor(found) if math.isfinite(found) else found
 
     def lasting_share(self, lmbda: float, step: int) -> float:
         """Predicted share of the bytes of `size` that is left at the end of the run, after the last pruning."""
-        size = self.size()
-        total = self.contributions()
+        lasting = missed(self.contributions(), self.config.control.idle_share)
         still = sum(at >= step for at in self.pruned_at)
-        lasting = missed(total, self.config.control.idle_share)
         if still:
             lasting &= self.lasting_anchors(lmbda, still)[:, None]
-        return self.size(lasting) / size if lasting.any() else 1.0
+        return self.size(lasting) / self.size() if lasting.any() else 1.0
 
     def lasting_anchors(self, lmbda: float, still: int) -> Tensor:
         """[N] bool: those that outlast so many prunings."""

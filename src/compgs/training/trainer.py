@@ -63,7 +63,7 @@ from compgs.training.distributed import (
 from compgs.training.dropout import thinned
 from compgs.training.events import Event, at_shares
 from compgs.training.few_views import fewness
-from compgs.training.file_size import anchor_bits, fixed_bytes, latent_bytes
+from compgs.training.file_size import anchor_bits, fixed_bytes
 from compgs.training.importance import LOOKED_AT, PRUNED_BY, missed, spread, view_contributions
 from compgs.training.initial import initial_model
 from compgs.training.loop import (
@@ -410,8 +410,8 @@ class Trainer:
     def prune(self) -> None:
         """Remove the anchors that are not worth their bits: what is left of the run makes up for them."""
         changes, bits = self.changes(PRUNED_BY), anchor_bits(self.model)
-        lmbda, least = self.rate.lmbda_of_pruning, self.target_size.least_bits()
-        kept = paying(changes, bits, lmbda, self.config.control, self.few, least_bits=least)
+        lmbda, (least, most) = self.rate.lmbda_of_pruning, self.target_size.bits_that_stay(self.step, bits)
+        kept = paying(changes, bits, lmbda, self.config.control, self.few, least_bits=least, most_bits=most)
         if kept.any():
             self.control.keep(self.model, self.optimizer, kept)
 
@@ -482,7 +482,7 @@ class Trainer:
 
     def estimated_bytes(self) -> int:
         """Size of the file if it were written now. Raises TrainingError if the latents are not finite any more."""
-        size = latent_bytes(self.model)
+        size = self.target_size.file.latents()
         if not math.isfinite(size):
             raise diverged(self.step, "rate", size)
         return int(size) + fixed_bytes(self.model)
