@@ -68,6 +68,8 @@ class ModelConfig:
     # lambda up to which anchors have their own in spite of it, where training views are few (22 and fewer): shared ones
     # stop to improve there while files grow; 0: never (not in the paper)
     residuals_where_few: Annotated[float, Range(0, 100)] = 0.001
+    # the same where views are many and a run passes over them 45 times and more
+    residuals_where_many: Annotated[float, Range(0, 100)] = 1e-5
     # hidden width of the residual MLPs (Ref.)
     width: Annotated[int, Range(8, 256, multiple=8)] = 32
     # networks are narrower, and their weights of fewer bits, than `width` and `head_bits` say where they would be a

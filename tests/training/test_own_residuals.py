@@ -25,16 +25,29 @@ def test_anchors_have_their_own_residuals_where_few_views_look_and_bits_are_chea
     assert own_residuals(load_config("paper"), 2000, 100), "as published"
 
 
-def test_a_size_that_is_asked_for_decides_by_its_bytes_for_an_anchor() -> None:
-    large, small = asked(target_bytes=24_000, lmbda=1.0), asked(target_bytes=23_999, lmbda=0.0)
-    assert own_residuals(large, 2000, 12) and not own_residuals(small, 2000, 12)
+@pytest.mark.parametrize(
+    ("lmbda", "steps", "per_step", "own"),
+    [(1e-5, 4500, 1, True), (1e-5, 4499, 1, False), (1e-5, 1125, 4, True), (2e-5, 30_000, 1, False)],
+)
+def test_where_many_views_look_they_have_them_in_long_runs_and_where_bits_cost_next_to_nothing(
+    lmbda: float, steps: int, per_step: int, own: bool
+) -> None:
+    assert own_residuals(asked(lmbda=lmbda, steps=steps, views_per_step=per_step), 2000, 100) == own
+
+
+@pytest.mark.parametrize(("views", "least"), [(12, 24_000), (100, 80_000)])
+def test_a_size_that_is_asked_for_decides_by_its_bytes_for_an_anchor(views: int, least: int) -> None:
+    large, small = asked(target_bytes=least, lmbda=1.0), asked(target_bytes=least - 1, lmbda=0.0)
+    assert own_residuals(large, 2000, views) and not own_residuals(small, 2000, views)
 
 
 @pytest.mark.parametrize("training", [{"lmbda": 0.0}, {"target_bytes": 10**9}])
-def test_a_limit_of_zero_keeps_residuals_shared(training: dict[str, float]) -> None:
+@pytest.mark.parametrize(("setting", "views"), [("residuals_where_few", 12), ("residuals_where_many", 100)])
+def test_a_limit_of_zero_keeps_residuals_shared(training: dict[str, float], setting: str, views: int) -> None:
     config = asked(**training)
-    config = replace(config, model=replace(config.model, residuals_where_few=0.0))
-    assert not own_residuals(config, 2000, 12)
+    assert own_residuals(config, 2000, views)
+    config = replace(config, model=replace(config.model, **{setting: 0.0}))
+    assert not own_residuals(config, 2000, views)
 
 
 def test_a_run_with_few_views_trains_encodes_and_resumes_with_residuals_of_its_own(

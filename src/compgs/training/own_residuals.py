@@ -1,23 +1,48 @@
 """Whether anchors have their own residual embeddings, where the settings leave it to training (not in the paper).
 
 Few views show a place from few sides, so that an anchor's primitives need to say less of how it looks from others, and
-more of what is there.
+more of what is there. Where views are many the same bits are better spent on more anchors, until bits are so cheap that
+more anchors bring nothing either; and then only a long run has the time to learn them.
 """
+
+from dataclasses import dataclass
 
 from compgs.config import Config
 from compgs.training.few_views import fewness
 
-# Bytes for each anchor of the beginning, from which on own residual embeddings are worth theirs in a file of a size
-# that is asked for: 10 to 19 where they were, with lambda 0.001 (docs/log/2026-11-23-15-residuals.md)
-BYTES_FOR_RESIDUALS = 12
-FEW_ENOUGH = 0.5  # `fewness` from which on they pay
+FEW_ENOUGH = 0.5  # `fewness` from which on views are few here
+PASSES = (
+    45  # over the training views, where these are many: 46 were enough, with 23 to 43 shared ones were better
+)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Up to which own residual embeddings are worth their bits."""
+
+    lmbda: float
+    # For each anchor of the beginning, where a file's size is asked for: what files had with that lambda
+    # (docs/log/2026-11-23-15-residuals.md, -16-top.md).
+    bytes: int
 
 
 def own_residuals(config: Config, anchors: int, views: int) -> bool:
     """Whether each anchor has its own in a run that starts with so many anchors."""
-    m, t = config.model, config.training
-    if m.residuals or m.residuals_where_few == 0 or fewness(views) < FEW_ENOUGH:
-        return m.residuals
+    t = config.training
+    if config.model.residuals:
+        return True
+    limits = _limits(config, views)
+    if limits.lmbda == 0:
+        return False
     if t.target_bytes is not None:
-        return t.target_bytes >= BYTES_FOR_RESIDUALS * anchors
-    return t.lmbda <= m.residuals_where_few
+        return t.target_bytes >= limits.bytes * anchors
+    return t.lmbda <= limits.lmbda
+
+
+def _limits(config: Config, views: int) -> Limits:
+    m, t = config.model, config.training
+    if fewness(views) >= FEW_ENOUGH:
+        return Limits(m.residuals_where_few, 12)
+    if t.steps * t.views_per_step >= PASSES * views:
+        return Limits(m.residuals_where_many, 40)
+    return Limits(0.0, 0)
