@@ -48,7 +48,7 @@ def main() -> None:
     network_bits, trained = model.config.entropy.network_bits, model.head_bits
 
     rows = torch.nonzero(model.mask.any(1)).view(-1)
-    exact = model.quantized(rows, rate=True, stored_weights=False, masked=True).bits
+    exact = model.quantized(rows, rate=True, stored_weights=False, mask=model.mask[rows]).bits
     floats = sum(float(b.sum(dtype=torch.float64)) for b in exact.values())
     print("| entropy networks | bits of all streams | against floats | file, bytes | PSNR, dB |")
     print("|---|---|---|---|---|")

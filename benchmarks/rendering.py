@@ -78,15 +78,15 @@ def peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
 
 
-def megabytes(*tensors: Any) -> float:
-    return sum(t.numel() * t.element_size() for t in tensors) / 1e6
+def megabytes(*arrays: Any) -> float:
+    return sum(array.nbytes for array in arrays) / 1e6
 
 
 def model_mb(model: Any) -> float:
     """What decoding hands over."""
     p = model.primitives
     return megabytes(
-        p.positions, p.log_scales, p.references, p.residuals, p.anchor_index, *model.heads.parameters()
+        p.positions, p.log_scales, p.references, p.residuals, p.anchor_index, *model.heads.tensors.values()
     )
 
 
