@@ -31,7 +31,7 @@ CONFIG = Config(
     model=ModelConfig(
         coupled_primitives=3, reference_dim=10, residuals=True, residual_dim=4, width=16, voxel_size=0.7
     ),
-    entropy=EntropyConfig(reference_hyper_dim=2, decorrelate_at=(0.3, 0.5, 0.65)),
+    entropy=EntropyConfig(reference_hyper_dim=2, decorrelate_at=(0.3, 0.5, 0.8)),
     control=ControlConfig(
         start=0.25,
         stop=0.6,
