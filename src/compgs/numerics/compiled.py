@@ -46,9 +46,8 @@ class Kernel(CPUDispatcher):
 class ParallelKernel(Kernel):
     """A compiled function whose calls are shared among threads."""
 
-    worth: Callable[..., int] | None = (
-        None  # of a call's arguments: among how many threads it is worth to share it
-    )
+    # Of a call's arguments: among how many threads at most it is worth to share it; None: among all
+    worth: Callable[..., int] | None = None
 
     def __call__(self, *args: Any) -> None:
         call = super().__call__
