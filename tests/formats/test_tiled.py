@@ -243,7 +243,9 @@ def changed(data: bytes) -> Iterator[bytes]:
     digits = [i for i in range(40, len(data)) if data[i : i + 1].isdigit()]
     for i in digits[:: max(1, len(digits) // 60)]:
         other = b"7" if data[i : i + 1] != b"7" else b"3"
-        yield data[:i] + other + data[i + 1 :]
+        one = data[:i] + other + data[i + 1 :]
+        if json.loads(one) != json.loads(data):  # the last digits of a float64 may say the same
+            yield one
     yield data.replace(b'"1_0"', b'"1_9"')
     yield data.replace(b'"core":null', b'"core":1', 1)
     yield data[: len(data) // 2]

@@ -11,7 +11,7 @@ from compgs.losses import Target, exposed, photometric_loss
 from compgs.metrics import psnr, to_8bit
 from compgs.model.splats import SplatModel
 from compgs.render import render
-from compgs.scene.views import Scene
+from compgs.scene.views import Scene, View
 from compgs.training.exposures import Exposures
 from compgs.training.splat_trainer import SplatTrainer
 from compgs.training.trainer import Trainer
@@ -71,24 +71,30 @@ def trained(kind: type, scene: Scene, config) -> tuple:
 
 @pytest.mark.parametrize(("kind", "steps"), [(Trainer, 160), (SplatTrainer, 240)])
 def test_known_exposures_are_recovered_and_pay_on_held_out_views(
-    blob_scene, tiny_config, kind, steps
+    blob_scene, blob_view, tiny_config, kind, steps
 ) -> None:
-    truth = known_exposures(9)
-    scene = photographed(blob_scene, truth)
+    # Halfway between the training views: one alone says little, differently on each processor.
+    between = tuple(blob_view(i + 0.5) for i in range(1, 8))
+    truth = known_exposures(15, seed=2)
+    scene = photographed(replace(blob_scene, test_views=between), truth)
     quality = {}
     for exposure in (False, True):
         training = replace(tiny_config.training, steps=steps, lmbda=0.0, exposure=exposure)
         trainer, model = trained(kind, scene, replace(tiny_config, training=training))
-        (view,) = scene.test_views
-        rendering = exposed_by_left_half(to_8bit(render(model, view.camera).image), view.image, None)
-        quality[exposure] = psnr(right_half(rendering), right_half(view.image))
-    assert quality[True] > quality[False] + 1.0
+        quality[exposure] = np.mean([of_right_half(model, view) for view in scene.test_views])
+    assert quality[True] > quality[False] + 0.5  # 0.9 to 1.8 dB, as the processor rounds
     # Gains of the views relative to one another: all of them together belong to the scene's colors. Eight views leave
     # some of each view's gain to colors that change with the direction.
     found = (trainer.views.exposures.neutral + trainer.views.exposures.change).numpy()
     learned, known = (relative_gains(exposures) for exposures in (found, truth[:8]))
     assert np.corrcoef(learned, known)[0, 1] > 0.9
     assert 0.3 < np.polyfit(known, learned, 1)[0] < 1.2
+
+
+def of_right_half(model, view: View) -> float:
+    """PSNR, with the exposure that fits the left half."""
+    rendering = exposed_by_left_half(to_8bit(render(model, view.camera).image), view.image, None)
+    return psnr(right_half(rendering), right_half(view.image))
 
 
 def relative_gains(exposures: np.ndarray) -> np.ndarray:
