@@ -42,7 +42,7 @@ def test_the_file_has_the_width_and_no_weight_of_more_bits(
     decoded = compgs.decode(tmp_path / "priced.cgs", "cpu")
     for name, tensor in decoded.heads.tensors.items():
         if tensor.ndim > 1 and np.abs(tensor).max() > 0 and "residual" not in name:
-            levels = tensor / np.abs(tensor[tensor != 0]).min()
+            levels = tensor / np.diff(np.unique(tensor)).min()  # two of so many weights are neighbours
             assert np.abs(levels - np.rint(levels)).max() < 1e-3 and np.abs(levels).max() < 1 << (bits - 1), (
                 name
             )
