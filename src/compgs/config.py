@@ -181,8 +181,8 @@ class TrainingConfig:
     rate: Literal["bits", "elements"] = "bits"
     # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
     rate_start: Share = 0.1
-    # (1 - w) L1 + w (1 - SSIM) (3DGS, Ref.: 0.2; more of SSIM makes it better at equal bytes, and PSNR no worse)
-    ssim_weight: Share = 0.35
+    # (1 - w) L1 + w (1 - SSIM) (3DGS)
+    ssim_weight: Share = 0.2
     # mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
     scale_weight: Annotated[float, Range(0, 1e6, below=True)] = 0.01
     # quantization steps per training step
@@ -233,8 +233,6 @@ class SplatConfig:
     Schedules are fractions of its 30 000 steps, with floors for short runs (`training/densification.py`).
     """
 
-    # (1 - w) L1 + w (1 - SSIM)
-    ssim_weight: Share = 0.2
     # degree of the spherical harmonics at the end
     harmonics: Annotated[int, Range(0, 3)] = 3
     # of the steps between two degrees (1 000 of 30 000)

@@ -31,11 +31,11 @@ def test_presets_steps_seed_and_settings_of_its_own_apply_to_3dgs() -> None:
         "--set",
         "splats.harmonics=1",
         "--set",
-        "splats.ssim_weight=0",
+        "training.ssim_weight=0",
     ]
     found = settings("-o", "run", "--method", "3dgs", *options)
     assert (found.method, found.config.training.steps, found.config.training.seed) == ("3dgs", 4000, 5)
-    assert (found.config.splats.harmonics, found.config.splats.ssim_weight) == (1, 0.0)
+    assert (found.config.splats.harmonics, found.config.training.ssim_weight) == (1, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -175,9 +175,7 @@ def test_a_run_resets_opacities_and_removes_what_is_large_only_afterwards(blob_s
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_the_loss_of_a_step_is_its_formula(blob_scene, weight):
-    trainer = SplatTrainer(
-        blob_scene, Config(training=TrainingConfig(steps=100), splats=SplatConfig(ssim_weight=weight)), CPU
-    )
+    trainer = SplatTrainer(blob_scene, Config(training=TrainingConfig(steps=100, ssim_weight=weight)), CPU)
     trainer.views.order = [2]
     result = trainer.train_step()
     photograph = torch.from_numpy(blob_scene.train_views[2].image.copy()).double() / 255

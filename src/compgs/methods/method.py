@@ -21,6 +21,7 @@ SPLAT_SETTINGS = (
     "training.steps",
     "training.views_per_step",
     "training.seed",
+    "training.ssim_weight",
     "training.exposure",
     "training.checkpoint_minutes",
 )

@@ -210,7 +210,7 @@ class SplatTrainer:
         return rasterize_step(gaussians, camera, self.settings, watched=self.schedule.active(self.step))
 
     def compare(self, drawn: Drawn) -> Tensor:
-        loss = photometric_loss(drawn.rendered.image, drawn.photograph, self.config.splats.ssim_weight)
+        loss = photometric_loss(drawn.rendered.image, drawn.photograph, self.config.training.ssim_weight)
         added = self.hooks.loss(drawn, self)
         return loss if added is None else loss + added
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from compgs.config import LearningRates, Share
+from compgs.config import LearningRates
 
 # What they use of `compgs.config`.
 ANCHOR_SETTINGS = (
@@ -27,6 +27,7 @@ ANCHOR_SETTINGS = (
     "control.finer_needs_coarser",
     "training.steps",
     "training.seed",
+    "training.ssim_weight",
     "training.scale_weight",
     "training.log_scale_lr",
     "training.covariance_lr",
@@ -41,10 +42,8 @@ ANCHOR_SETTINGS = (
 
 @dataclass(frozen=True)
 class AnchorSection:
-    """The loss, and learning rates of what only these anchors have."""
+    """Learning rates of what only these anchors have."""
 
-    # (1 - w) L1 + w (1 - SSIM) (3DGS, Scaffold-GS)
-    ssim_weight: Share = 0.2
     # of features (Scaffold-GS: 0.0075 for 30 000 steps; here as far as the default preset's in a short run)
     feature_lr: LearningRates = (0.0165, 1e-4)
     # of offsets, in units of the position scale (Scaffold-GS)

@@ -160,7 +160,7 @@ class AnchorTrainer:
         return rasterize_step(gaussians, camera, self.settings, watched=self.schedule.active(self.step))
 
     def compare(self, rendered: RasterResult, target: Target) -> Tensor:
-        return photometric_loss(rendered.image, target, self.config.anchors.ssim_weight)
+        return photometric_loss(rendered.image, target, self.config.training.ssim_weight)
 
     def regularize(self, prediction: Prediction, camera: Camera) -> Tensor:
         """Penalties on large primitives and on a vanishing scene."""
