@@ -143,7 +143,7 @@ def test_an_anchors_residuals_have_one_hyperprior_channel_for_each(paper: Config
     config = dataclasses.replace(paper, model=settings)
     model = TrainedModel(config, torch.zeros(1, 3, dtype=torch.int32), 1.0, 1.0, (0.0, 0.0, 0.0))
     assert isinstance(model.entropy, OwnResidualsEntropyModel)
-    assert model.entropy.residual_analysis.second.out_features == coupled
+    assert model.entropy.residual_hyperprior.analysis.second.out_features == coupled
 
 
 def test_a_run_of_the_published_length_is_controlled_as_published(paper: Config) -> None:

@@ -12,6 +12,7 @@ from compgs.codec.integer_network import IntegerNetwork, entropy_parameters, eva
 from compgs.codec.reader import file_info, group_names, read_content
 from compgs.codec.writer import write_content
 from compgs.config import Config, EntropyConfig, ModelConfig
+from compgs.entropy.contexts import Hyperprior
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import CorruptSection, NotEncodable, OutputError, TruncatedSection
@@ -22,6 +23,11 @@ from compgs.trained_model import TrainedModel
 from compgs.training.decorrelation import keep_channels
 
 OWN_RESIDUALS = Config(model=ModelConfig(residuals=True))
+
+
+def entropy_of(blocks: int, width: int = 16) -> EntropyConfig:
+    """The paper's kind of entropy model with blocks; the default's, without hyperprior, without them."""
+    return EntropyConfig(reference_hyper_dim=4 if blocks else 0, network_blocks=blocks, network_width=width)
 
 
 def made_model(anchors: int = 400, seed: int = 0, config: Config | None = None) -> TrainedModel:
@@ -47,9 +53,7 @@ def by_position(primitives) -> dict[tuple[int, ...], int]:
 @pytest.mark.parametrize("blocks", [0, 2])
 @pytest.mark.parametrize("residuals", [True, False])
 def test_the_decoded_scene_is_the_one_that_training_rendered(tmp_path, blocks, residuals):
-    config = Config(
-        model=ModelConfig(residuals=residuals), entropy=EntropyConfig(network_blocks=blocks, network_width=16)
-    )
+    config = Config(model=ModelConfig(residuals=residuals), entropy=entropy_of(blocks))
     model = made_model(config=config)
     with torch.no_grad():
         model.entropy.log_covariance_step.add_(torch.linspace(-0.5, 0.5, 6))  # six steps
@@ -78,11 +82,11 @@ def test_the_decoded_scene_is_the_one_that_training_rendered(tmp_path, blocks, r
 @pytest.mark.parametrize("blocks", [0, 2])
 def test_bits_match_the_files_sections_within_one_percent(blocks):
     """Streams above 10 kB."""
-    config = replace(OWN_RESIDUALS, entropy=EntropyConfig(network_blocks=blocks, network_width=16))
-    model = made_model(7000, config=config)
+    model = made_model(7000, config=replace(OWN_RESIDUALS, entropy=entropy_of(blocks)))
     with torch.no_grad():
-        for analysis in (model.entropy.reference_analysis, model.entropy.residual_analysis):
-            analysis.second.weight.mul_(8)  # hyperpriors that are worth coding
+        for hyperprior in (model.entropy.reference_context, model.entropy.residual_hyperprior):
+            if isinstance(hyperprior, Hyperprior):
+                hyperprior.analysis.second.weight.mul_(8)  # worth coding
         # As after training, the scales fit the latents; symbols far out in the tails are capped by the tables.
         for network in (model.entropy.reference_network, model.entropy.residual_network):
             network.weights[-1][network.channels :].zero_()
@@ -100,12 +104,15 @@ def test_bits_match_the_files_sections_within_one_percent(blocks):
         ("covariance", "log scales"),
         ("residual", "residual embeddings"),
     ):
+        if stream not in estimated:
+            assert stream == "reference_hyper" and section not in sections
+            continue
         if sections[section] > 80_000:
             assert sections[section] == pytest.approx(estimated[stream], rel=0.01)
             compared += 1
         state_and_sizes = 96 * len(info.ranges)
         assert sections[section] == pytest.approx(tables[section], rel=0.002, abs=state_and_sizes)
-    assert compared >= 4
+    assert compared >= 3 + (blocks > 0)
 
 
 def test_anchors_without_primitives_are_left_out(tmp_path):
@@ -202,7 +209,24 @@ def test_shared_residuals_are_in_the_file_though_no_symbol_is(tmp_path):
     assert np.array_equal(decoded, model.as_hybrid_model().primitives.residuals)
     info = file_info((tmp_path / "a.cgs").read_bytes())
     assert not [s.name for s in info.sections if s.name.startswith("residual")]
-    assert [g.role for g in info.dimensions.groups] == [Role.SIDE, Role.REFERENCE, Role.LOG_SCALES]
+    assert [g.role for g in info.dimensions.groups] == [Role.REFERENCE, Role.LOG_SCALES]
+
+
+def test_without_a_hyperprior_each_channel_of_the_references_has_one_mean_and_one_scale():
+    """A network on the anchors' coordinates, of zeros, which take no byte each."""
+    config = Config(entropy=EntropyConfig(reference_hyper_dim=0))
+    content = to_content(made_model(2000, config=config))
+    references, log_scales = content.groups
+    assert (references.shape.role, references.shape.context) == (Role.REFERENCE, ())
+    assert references.shape.sees_coordinates and not log_scales.shape.sees_coordinates
+    assert log_scales.shape.context == (0,)
+    (layer,) = references.prior.layers
+    assert layer.weight.shape == (64, 3) and not layer.weight.any()
+    sizes = {s.name: s.bytes for s in file_info(write_content(content)).sections}
+    other = to_content(made_model(2000, config=Config(entropy=EntropyConfig(reference_hyper_dim=1))))
+    with_one = {s.name: s.bytes for s in file_info(write_content(other)).sections}
+    assert sizes["entropy networks"] < with_one["entropy networks"] - 40
+    assert "reference hyperprior" not in sizes and sizes["tables"] == 0
 
 
 def test_own_residuals_leave_no_tensor_of_shared_ones():
@@ -288,8 +312,9 @@ def test_the_network_that_is_trained_is_the_one_in_the_file(blocks, bits):
 
 def test_an_entropy_model_of_every_kind_is_written_as_the_paper_has_it():
     """Roles, contexts and shapes of networks: residual MLPs of so many blocks, references as context."""
-    entropy = EntropyConfig(network_blocks=2, network_width=12)
-    content = to_content(made_model(50, config=replace(OWN_RESIDUALS, entropy=entropy)))
+    config = replace(OWN_RESIDUALS, entropy=entropy_of(blocks=2, width=12))
+    content = to_content(made_model(50, config=config))
+    assert not any(g.shape.sees_coordinates for g in content.groups)
     assert [(g.shape.role, g.shape.context) for g in content.groups] == [
         (Role.SIDE, ()),
         (Role.REFERENCE, (0,)),

@@ -101,7 +101,8 @@ def test_outside_the_tables_only_a_gradient_that_leads_back_passes(dtype):
     s = [-4.0, -4.0, 130.0, 130.0]
     bits, _, by_s = evaluate(x, s, dtype)
     inside, _, _ = evaluate(x, [0.0, 0.0, 127.0, 127.0], dtype)
-    np.testing.assert_array_equal(bits, inside)
+    # To a few units of the last place: a compiler may add in another order.
+    np.testing.assert_allclose(bits, inside, rtol=2e-6)
     assert by_s[0] < 0 and by_s[3] > 0
     assert by_s[1] == 0 and by_s[2] == 0
 

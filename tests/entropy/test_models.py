@@ -95,21 +95,21 @@ def test_without_noise_training_sees_the_density_at_the_symbols_and_has_gradient
     """The end of a training: a histogram, which counts symbols, would have none."""
     latents = [torch.randn(40, n).requires_grad_() for n in (6, 6, 12)]
     bits = entropy(*latents, rate=True).bits
-    symbols = entropy.reference_analysis(latents[0]).round()
-    torch.testing.assert_close(bits["reference_hyper"], entropy.reference_density.bits(symbols))
+    symbols = entropy.reference_context.analysis(latents[0]).round()
+    torch.testing.assert_close(bits["reference_hyper"], entropy.reference_context.density.bits(symbols))
     torch.stack([b.sum() for b in bits.values()]).sum().backward()
     assert all(float(y.grad.abs().sum()) > 0 for y in latents)
-    assert float(entropy.residual_density.logits.grad.abs().sum()) > 0
+    assert float(entropy.residual_hyperprior.density.logits.grad.abs().sum()) > 0
 
 
 def test_in_training_the_likelihood_sees_latents_and_hyperpriors_with_noise_in_place_of_rounding(entropy):
     f, c, g = latents()
     bits = entropy(f, c, g, rate=True, noise=lambda like: torch.full_like(like, 0.3)).bits
-    z = entropy.reference_analysis(f), entropy.residual_analysis(g)
+    z = entropy.reference_context.analysis(f), entropy.residual_hyperprior.analysis(g)
     for name, y, density in zip(
         ("reference_hyper", "residual_hyper"),
         z,
-        (entropy.reference_density, entropy.residual_density),
+        (entropy.reference_context.density, entropy.residual_hyperprior.density),
         strict=True,
     ):
         # The mass of a unit interval lies in two bins, in proportion.
@@ -132,12 +132,12 @@ def test_scales_start_anew_at_the_spread_around_what_the_hyperprior_expects(entr
     references = latents(400)[0] + torch.tensor([0.0, 5.0, 0.0, 0.0, 0.0, 0.0])
     references[:, 3] = 1.0
     with torch.no_grad():
-        for layer in (entropy.reference_analysis.first, entropy.reference_analysis.second):
+        for layer in (entropy.reference_context.analysis.first, entropy.reference_context.analysis.second):
             layer.weight.mul_(2.0)
         entropy.reference_network.weights[-1][3] = 0
     weight, bias = entropy.restart_reference_scales(references)
     with torch.no_grad():
-        mean, scale = entropy.reference_network(entropy.reference_analysis(references).round())
+        mean, scale = entropy.reference_network(entropy.reference_context.analysis(references).round())
     spread = (references - mean).double().std(0, correction=0)
     plain = references.double().std(0, correction=0)
     assert spread[3] < 1e-3
@@ -152,7 +152,7 @@ def test_a_file_is_estimated_by_the_histograms_of_its_hyperpriors(entropy):
     with torch.no_grad():
         f, c, g = latents()
         bits = entropy(f, c, g, rate=True).bits["reference_hyper"]
-        symbols = entropy.reference_analysis(f).round().to(torch.int64)
+        symbols = entropy.reference_context.analysis(f).round().to(torch.int64)
     expected = [
         sum(-math.log2(float((column == column[i]).double().mean())) for column in symbols.unbind(1))
         for i in range(len(f))
@@ -184,7 +184,7 @@ def test_residuals_are_predicted_from_references_and_then_their_hyperprior(entro
         entropy.residual_network.inputs_of_last,
     )
     references = entropy(f, c, g, rate=False).references
-    hyper = entropy.residual_analysis(g).round()
+    hyper = entropy.residual_hyperprior.analysis(g).round()
     assert hyper.shape[1] == MODEL.coupled_primitives
     torch.testing.assert_close(seen["x"], torch.cat([references, hyper], 1))
 
@@ -220,7 +220,7 @@ def test_readers_of_the_references_are_all_the_weights_that_see_them(entropy):
 
     def predicted(references):
         return [
-            entropy.reference_analysis(references),
+            entropy.reference_context.analysis(references),
             *entropy.covariance_network(references),
             *entropy.residual_network(torch.cat([references, z], 1)),
         ]

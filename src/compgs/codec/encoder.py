@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from compgs import __version__
 from compgs.codec.anchor_order import canonical_order
@@ -34,7 +34,7 @@ from compgs.codec.viewpoint_cameras import viewpoints_from_cameras
 from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 from compgs.codec.writer import Geometry, write_content
-from compgs.entropy.factorized import FactorizedDensity
+from compgs.entropy.contexts import Hyperprior
 from compgs.entropy.models import OwnResidualsEntropyModel
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
@@ -145,11 +145,11 @@ class _Chain:
         self.groups: list[Group] = []
         self.coded: list[CodedGroup] = []
 
-    def add_side(self, analysis: nn.Module, density: FactorizedDensity, y: Tensor) -> int:
+    def add_side(self, hyperprior: Hyperprior, y: Tensor) -> int:
         """A hyperprior of the latents y [N, C]; its number."""
         # In float64, so that a symbol does not depend on how many anchors are analyzed together.
-        symbols = _symbols(copy.deepcopy(analysis).cpu().double()(y))
-        tables = hyper_tables(density.probabilities().double().cpu().numpy(), symbols)
+        symbols = _symbols(copy.deepcopy(hyperprior.analysis).cpu().double()(y))
+        tables = hyper_tables(hyperprior.density.probabilities().double().cpu().numpy(), symbols)
         return self._add(GroupShape(Role.SIDE, symbols.shape[1]), tables, symbols.astype(np.float64))
 
     def add(self, shape: GroupShape, network: EntropyNetwork, y: Tensor) -> int:
@@ -173,9 +173,10 @@ class _Chain:
 
 def _code_references(chain: _Chain, model: TrainedModel, kept: Tensor) -> None:
     entropy, f = model.entropy, _rows(model.references, kept)
-    side = chain.add_side(entropy.reference_analysis, entropy.reference_density, f)
-    steps = (_float32(model.config.entropy.reference_step),)
-    chain.add(GroupShape(Role.REFERENCE, f.shape[1], steps, (side,)), entropy.reference_network, f)
+    steps, context = (_float32(model.config.entropy.reference_step),), entropy.reference_context
+    sides = (chain.add_side(context, f),) if isinstance(context, Hyperprior) else ()
+    shape = GroupShape(Role.REFERENCE, f.shape[1], steps, sides, sees_coordinates=not sides)
+    chain.add(shape, entropy.reference_network, f)
 
 
 def _code_log_scales(chain: _Chain, model: TrainedModel, kept: Tensor) -> None:
@@ -194,7 +195,7 @@ def _code_residuals(chain: _Chain, model: TrainedModel, kept: Tensor) -> None:
         return
     g = _rows(model.residuals, kept)
     references = next(i for i, group in enumerate(chain.groups) if group.shape.role == Role.REFERENCE)
-    side = chain.add_side(entropy.residual_analysis, entropy.residual_density, g)
+    side = chain.add_side(entropy.residual_hyperprior, g)
     steps = (_float32(model.config.entropy.residual_step),)
     shape = GroupShape(Role.RESIDUAL, model.dimensions.residual_dim, steps, (references, side))
     chain.add(shape, entropy.residual_network, g)

@@ -123,6 +123,7 @@ def _array(x: Tensor) -> np.ndarray:
 
 _ZERO = np.float32(0)
 _ONE_FIXED, _FIXED_STEP = np.float32(1 << FRACTION_BITS), np.float32(2.0**-FRACTION_BITS)
+_HALF = np.float32(0.5)
 _TOP = np.float32(SCALE_LEVELS - 1)
 
 
@@ -133,8 +134,8 @@ def _quantize_row(y, out, noise, fixed, y_hat, x, s):
     for i in range(c):
         mean, scale = out[i], out[c + i]
         if fixed:
-            mean = np.rint(mean * _ONE_FIXED) * _FIXED_STEP
-            scale = np.rint(scale * _ONE_FIXED) * _FIXED_STEP
+            mean = np.floor(mean * _ONE_FIXED + _HALF) * _FIXED_STEP  # as `round_fixed`
+            scale = np.floor(scale * _ONE_FIXED + _HALF) * _FIXED_STEP
         distance = y[i] - mean
         symbol = np.rint(distance)
         y_hat[i] = symbol + mean

@@ -15,10 +15,9 @@ from torch import Tensor, nn
 
 from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy.conditional import code_latents
-from compgs.entropy.factorized import FactorizedDensity
-from compgs.entropy.network import EntropyNetwork, leaky
-from compgs.entropy.quantization import round_straight_through
-from compgs.tensors.linear import Reader, linear
+from compgs.entropy.contexts import Hyperprior, NoContext
+from compgs.entropy.network import EntropyNetwork
+from compgs.tensors.linear import Reader
 
 STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")
 
@@ -28,20 +27,6 @@ SLOT_SPREAD = 0.4
 SMALLEST_COVARIANCE_STEP = 0.005
 # Of scales that are set from the data, in steps: one symbol in eighty is other than zero there.
 SMALLEST_SPREAD = 0.2
-
-
-class HyperAnalysis(nn.Module):
-    """The encoder's half of a hyperprior: y -> z. It never goes into the file."""
-
-    def __init__(self, inputs: int, channels: int) -> None:
-        super().__init__()
-        self.first = nn.Linear(inputs, channels)
-        self.second = nn.Linear(channels, channels)
-
-    def forward(self, y: Tensor) -> Tensor:
-        first, second = self.first, self.second
-        hidden = leaky(linear(y, first.weight.t(), first.bias))
-        return linear(hidden, second.weight.t(), second.bias)
 
 
 @dataclass(frozen=True)
@@ -72,7 +57,7 @@ class Quantized:
 
 
 class EntropyModel(nn.Module):
-    """Hyperprior for the reference embeddings, the references as context for everything else (CompGS Sec. 3.3).
+    """The references as context for everything else; a hyperprior for them, or none (CompGS Sec. 3.3).
 
     f ──analysis──► z_f ──► (mean, scale) of f
     f_hat ──► (mean, scale) of c
@@ -85,9 +70,15 @@ class EntropyModel(nn.Module):
         self.slots = model.coupled_primitives
         self.residual_channels = model.coupled_primitives * model.residual_dim
         shape = entropy.network_blocks, entropy.network_width
-        self.reference_analysis = HyperAnalysis(model.reference_dim, entropy.reference_hyper_dim)
-        self.reference_density = FactorizedDensity(entropy.reference_hyper_dim)
-        self.reference_network = EntropyNetwork(entropy.reference_hyper_dim, model.reference_dim, *shape)
+        hyper = entropy.reference_hyper_dim
+        self.reference_context: Hyperprior | NoContext = (
+            Hyperprior("reference_hyper", model.reference_dim, hyper) if hyper else NoContext()
+        )
+        self.reference_network = EntropyNetwork(
+            self.reference_context.outputs, model.reference_dim, *(shape if hyper else ())
+        )
+        if not hyper:
+            self.reference_network.make_constant()
         # Log scales span a few natural units, that is dozens of steps.
         self.covariance_network = EntropyNetwork(
             model.reference_dim, 6, *shape, mean_gain=1.0 / entropy.covariance_step
@@ -108,7 +99,7 @@ class EntropyModel(nn.Module):
     def channels(self) -> dict[str, int]:
         """Symbols that each stream codes for an anchor, by the stream's name."""
         return {
-            "reference_hyper": len(self.reference_density.logits),
+            **self.reference_context.channels,
             "reference": self.reference_network.channels,
             "covariance": self.covariance_network.channels,
         }
@@ -129,8 +120,7 @@ class EntropyModel(nn.Module):
 
     def readers(self) -> Iterator[Reader]:
         """The layers that take the references."""
-        analysis = self.reference_analysis.first
-        yield Reader(analysis.weight, analysis.bias, 1, 0, 1.0)
+        yield from self.reference_context.readers()
         yield from self.covariance_network.readers(0)
 
     def starting_residuals(self) -> Tensor:
@@ -139,14 +129,16 @@ class EntropyModel(nn.Module):
 
     @torch.no_grad()
     def restart_reference_scales(self, references: Tensor) -> tuple[nn.Parameter, nn.Parameter]:
-        """Scales of the references as they are now, [N, reference_dim], whatever the hyperprior says of them; the two
-        parameters whose second halves these are.
+        """Scales of the references as they are now, [N, reference_dim], whatever the hyperprior says of them, and
+        without one their means; the two parameters whose second halves the scales are.
         """
-        network = self.reference_network
-        mean, _ = network(round_straight_through(self.reference_analysis(references)))
-        # numpy's sums do not depend on the number of threads
-        spread = (references - mean).double().cpu().numpy().std(0)
+        network, context = self.reference_network, self.reference_context
         weight, bias = network.weights[-1], network.biases[-1]
+        # numpy's sums do not depend on the number of threads
+        if isinstance(context, NoContext):
+            bias[: network.channels] = torch.from_numpy(references.double().cpu().numpy().mean(0))
+        mean, _ = network(context.decoded(context(references)))
+        spread = (references - mean).double().cpu().numpy().std(0)
         weight[network.channels :] = 0
         bias[network.channels :] = torch.from_numpy(np.log2(np.maximum(spread, SMALLEST_SPREAD)))
         return weight, bias
@@ -167,12 +159,12 @@ class EntropyModel(nn.Module):
         With `noise` the likelihood sees uniform noise (training), without it the symbols themselves (the size of the
         file). `network_bits`: the networks' weights as the file will hold them.
         """
-        z_f = self.reference_analysis(references)
+        known = self.reference_context(references)
         code = partial(code_latents, rate=rate, noise=noise, network_bits=network_bits)
-        f_hat, bits_f = code(references, round_straight_through(z_f), self.reference_network)
+        f_hat, bits_f = code(references, self.reference_context.decoded(known), self.reference_network)
         c_hat, bits_c = code(covariances, f_hat, self.covariance_network)
         bits = {
-            "reference_hyper": _hyper_bits(self.reference_density, z_f, noise) if rate else bits_f,
+            **(self.reference_context.bits(known, noise) if rate else {}),
             "reference": bits_f,
             "covariance": bits_c,
         }
@@ -203,8 +195,7 @@ class OwnResidualsEntropyModel(EntropyModel):
     def __init__(self, model: ModelConfig, entropy: EntropyConfig) -> None:
         super().__init__(model, entropy)
         hyper = self.slots  # one channel for each coupled primitive (Ref.)
-        self.residual_analysis = HyperAnalysis(self.residual_channels, hyper)
-        self.residual_density = FactorizedDensity(hyper)
+        self.residual_hyperprior = Hyperprior("residual_hyper", self.residual_channels, hyper)
         self.residual_network = EntropyNetwork(
             model.reference_dim + hyper,
             self.residual_channels,
@@ -220,7 +211,7 @@ class OwnResidualsEntropyModel(EntropyModel):
 
     @property
     def channels(self) -> dict[str, int]:
-        own = {"residual_hyper": self.slots, "residual": self.residual_channels}
+        own = {**self.residual_hyperprior.channels, "residual": self.residual_channels}
         return {**super().channels, **own}
 
     def readers(self) -> Iterator[Reader]:
@@ -241,11 +232,11 @@ class OwnResidualsEntropyModel(EntropyModel):
         noise: Callable[[Tensor], Tensor] | None,
         mask: Tensor | None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        z_g = self.residual_analysis(residuals)
-        context = torch.cat([f_hat, round_straight_through(z_g)], 1)
+        z_g = self.residual_hyperprior(residuals)
+        context = torch.cat([f_hat, self.residual_hyperprior.decoded(z_g)], 1)
         g_hat, bits_g = code(residuals, context, self.residual_network, mask=mask)
-        hyper = _hyper_bits(self.residual_density, z_g, noise) if rate else bits_g
-        return g_hat, {"residual_hyper": hyper, "residual": bits_g}
+        hyper = self.residual_hyperprior.bits(z_g, noise) if rate else {}
+        return g_hat, {**hyper, "residual": bits_g}
 
 
 Coder = Callable[..., tuple[Tensor, Tensor]]  # `code_latents` with what a whole step has in common
@@ -254,19 +245,3 @@ Coder = Callable[..., tuple[Tensor, Tensor]]  # `code_latents` with what a whole
 def make_entropy_model(model: ModelConfig, entropy: EntropyConfig) -> EntropyModel:
     """The one for a model's kind of residual embeddings: chosen here, once."""
     return (OwnResidualsEntropyModel if model.residuals else EntropyModel)(model, entropy)
-
-
-def _hyper_bits(density: FactorizedDensity, z: Tensor, noise: Callable[[Tensor], Tensor] | None) -> Tensor:
-    """[N] bits of hyperpriors: by the learned density in training; by the symbols' own histogram, which is what the
-    file's tables hold, when the size of the file is asked for. The density is some per cent above it: it has to be as
-    smooth as the noise.
-    """
-    if noise is not None:
-        return density.bits(z + noise(z))
-    if z.requires_grad:  # training with symbols: a histogram has no gradient
-        return density.bits(round_straight_through(z))
-    bits = z.new_zeros(len(z))
-    for symbols in z.round().to(torch.int64).unbind(1):
-        _, inverse, counts = torch.unique(symbols, return_inverse=True, return_counts=True)
-        bits -= torch.log2(counts / len(symbols))[inverse]
-    return bits

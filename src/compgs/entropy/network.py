@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from compgs.entropy.quantization import quantize_weight, round_straight_through
+from compgs.entropy.quantization import quantize_weight
 from compgs.tensors.linear import Reader, linear
 
 # A power of two, so that the decoder's leaky ReLU is a shift.
@@ -21,9 +22,22 @@ UNIT_SCALE = 60.0
 FRACTION_BITS = 12
 
 
+class _RoundHalfUp(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return torch.floor(x + 0.5)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        return grads[0]
+
+
 def round_fixed(x: Tensor) -> Tensor:
-    """The nearest number that the decoder's fixed point can hold, straight-through."""
-    return round_straight_through(x * 2.0**FRACTION_BITS) * 2.0**-FRACTION_BITS
+    """The nearest number that the decoder's fixed point can hold, straight-through; of two the larger, as there: few
+    weights have so many digits that none of their sums lies half-way.
+    """
+    rounded: Tensor = _RoundHalfUp.apply(x * 2.0**FRACTION_BITS)
+    return rounded * 2.0**-FRACTION_BITS
 
 
 class EntropyNetwork(nn.Module):
@@ -63,6 +77,11 @@ class EntropyNetwork(nn.Module):
         offset[channels:] = UNIT_SCALE
         self.register_buffer("gain", gain)
         self.register_buffer("offset", offset)
+
+    def make_constant(self) -> None:
+        """Means and scales that depend on nothing: of a single layer, biases are all that is learned."""
+        assert not self.blocks
+        nn.init.zeros_(self.weights[0].requires_grad_(False))
 
     def readers(self, first: int) -> Iterator[Reader]:
         """The layers that take the input; what is meant begins at its channel `first`."""

@@ -36,7 +36,7 @@ from compgs.training.restoring import (
 )
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
-CHECKPOINT_VERSION = "4"
+CHECKPOINT_VERSION = "5"
 
 
 @dataclass(frozen=True)
