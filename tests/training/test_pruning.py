@@ -227,7 +227,8 @@ def test_pruning_takes_what_does_not_pay_by_the_bits_of_the_file(unequal: Traine
     bits = sum(stream.detach().double().numpy() for stream in streams) + 10
     ratio = 20 * changes / bits * len(bits) * 132 / 5
     # In the middle of the widest gap, so that no rounding decides.
-    least = np.sort(ratio[changes > 0])[int(0.17 * len(ratio)) : int(0.25 * len(ratio))]
+    some = int((changes > 0).sum())
+    least = np.sort(ratio[changes > 0])[int(0.17 * some) : int(0.25 * some)]
     gap = int(np.argmax(least[1:] / least[:-1]))
     lmbda = float(np.sqrt(least[gap] * least[gap + 1]))
     kept = (ratio > lmbda) & (changes > 0)
