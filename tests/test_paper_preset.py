@@ -64,6 +64,7 @@ PUBLISHED = {
     "training.head_warm_up": 0.0,
     "training.hard_rate": 1.0,
     "training.left_out": 0.0,
+    "training.coarse_until": 0.0,
 }
 
 

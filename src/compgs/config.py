@@ -182,6 +182,9 @@ class TrainingConfig:
     rate: Literal["bits", "elements"] = "bits"
     # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
     rate_start: Share = 0.1
+    # of the steps until which photographs of 160 000 pixels and more are halved, larger ones more than once; 0: never
+    # (not in the paper; `training/coarse.py`)
+    coarse_until: Share = 0.7
     # (1 - w) L1 + w (1 - SSIM) (3DGS)
     ssim_weight: Share = 0.2
     # mean product of the primitives' scales, see `losses.scale_unit` (Ref.)

@@ -11,10 +11,9 @@ import torch
 
 from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import Packed
-from compgs.losses import Target
 from compgs.methods import settings_of, train, write
 from compgs.methods.eagles.file import cosines, decoded
-from compgs.methods.eagles.hooks import Latents, image_scale, smaller
+from compgs.methods.eagles.hooks import Latents, image_scale
 from compgs.methods.parts.histogram import packed_symbols, unpacked_symbols
 from compgs.methods.parts.significance import view_significance
 from compgs.render import render
@@ -159,19 +158,6 @@ def test_images_grow_from_coarse_to_fine(blob_scene: Scene) -> None:
     assert drawn.photograph.image.shape == (11, 14, 3) == drawn.rendered.image.shape
     made.step = 28
     assert made.draw(0).camera.width == 48
-
-
-def test_a_smaller_photograph_is_means_of_the_large_one() -> None:
-    image = np.zeros((4, 6, 3), np.uint8)
-    image[:2, :2], image[2, 4] = 200, 100
-    mask = np.zeros((4, 6), bool)
-    mask[:2, :2] = mask[2, 2:4] = mask[3, 5] = True
-    small = smaller(Target.from_image(image, mask=mask), 3, 2)
-    assert small.image[..., 0].tolist() == [[200, 0, 0], [0, 0, 25]]
-    assert small.counted is not None and small.counted.tolist() == [
-        [True, False, False],
-        [False, True, False],
-    ]
 
 
 def test_what_the_views_see_least_of_is_pruned(blob_scene: Scene) -> None:

@@ -49,6 +49,7 @@ from compgs.training.checkpoint import (
     restore_optimizer,
     save_checkpoint,
 )
+from compgs.training.coarse import CoarseViews
 from compgs.training.control import AdaptiveControl, make_schedule
 from compgs.training.culling import MEASURED_AT_ONCE, AnchorBounds
 from compgs.training.decorrelation import channel_rates, decorrelate, drop_silent_channels
@@ -140,6 +141,7 @@ class Trainer:
         t, views = config.training, len(scene.train_views)
         per_step = t.views_per_step
         self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure, per_step=per_step)
+        self.coarse = CoarseViews(self.views, t.coarse_until)
         self.config = config
         self.device = device
         self.model = (model or initial_model(scene, config)).to(device)
@@ -227,7 +229,7 @@ class Trainer:
     ) -> StepResult:
         """One of the step's views: its gradients by the latents, the heads and its exposure."""
         view, part = looks.views[number], looks.own.part_of(number)
-        camera, photograph = self.scene.train_views[view].camera, self.views.photograph(view)
+        camera, photograph = self.coarse.look(view, self.scene.train_views[view].camera, self.progress)
         rows = looks.own.rows_of(number)
         if geometry is not None:
             geometry = geometry.of(None if part is None else self.model.slots(part))

@@ -70,7 +70,10 @@ class ViewsInTurn:
 
     def photograph(self, index: int) -> Target:
         """What to compare a rendering of a view with, at the exposure of the view where exposures are learned."""
-        target = self.stored(index)
+        return self.with_exposure(index, self.stored(index))
+
+    def with_exposure(self, index: int, target: Target) -> Target:
+        """What a view is compared with, at its exposure where exposures are learned."""
         return target if self.exposures is None else replace(target, exposure=self.exposures.of(index))
 
     def exposure_gradients(self, views: Sequence[int]) -> tuple[Tensor, ...]:

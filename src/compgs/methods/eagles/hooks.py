@@ -23,6 +23,7 @@ from compgs.model.degrees import harmonics_above_dc
 from compgs.scene.views import Scene
 from compgs.tensors.splats import Splats
 from compgs.training import Hooks, Phase, Run, SplatTrainer, train_phases
+from compgs.training.coarse import smaller
 from compgs.training.importance import PRUNED_BY, spread
 from compgs.training.optimizers import rates_for, replace_parameter
 from compgs.training.splat_trainer import HOOKS
@@ -187,20 +188,6 @@ def image_scale(progress: float, smallest: float, until: float) -> float:
     if progress >= until:
         return 1.0
     return smallest + (1 - smallest) * 0.5 * (1 - math.cos(math.pi * progress / until))
-
-
-def smaller(photograph: Target, width: int, height: int) -> Target:
-    """Means over the pixels that become one. One counts if at least half of what it is made of does."""
-
-    def shrunk(image: Tensor) -> Tensor:  # [H, W, C]
-        small = nn.functional.interpolate(image.permute(2, 0, 1)[None].float(), (height, width), mode="area")
-        return small[0].permute(1, 2, 0)
-
-    image = shrunk(photograph.image).round().to(torch.uint8).contiguous()
-    counted = photograph.counted
-    if counted is not None:
-        counted = (shrunk(counted[..., None])[..., 0] >= 0.5).contiguous()
-    return replace(photograph, image=image, counted=counted)
 
 
 def train_latents(scene: Scene, config: EaglesConfig, run: Run) -> Content:

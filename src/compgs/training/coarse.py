@@ -1,0 +1,70 @@
+"""Coarse photographs first (not in the paper): what a step costs by its pixels is saved until details are due.
+
+Until a share of the run photographs and renderings have a half of their width and height, or a quarter, an eighth in
+equal parts of it before, as long as COARSEST_PIXELS are left: with fewer the prediction networks, and not the pixels,
+are what a step takes its time for. At 480 x 359 pixels a run takes a quarter less time for the same quality in the same
+bytes, at 960 x 717 four tenths less (docs/log/2026-11-24-21-context.md).
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from compgs.cameras import Camera
+from compgs.losses import Target
+from compgs.training.views_in_turn import ViewsInTurn
+
+COARSEST_PIXELS = 40_000
+KEPT_BYTES = 1 << 29  # of coarse photographs, 3 bytes a pixel
+
+
+def halvings(progress: float, until: float, width: int, height: int) -> int:
+    """How often a photograph of that size is halved at a `progress` of the run, 0 to 1."""
+    if progress >= until:
+        return 0
+    possible = int(math.log(max(1.0, width * height / COARSEST_PIXELS), 4))
+    return math.ceil(possible * (1 - progress / until))
+
+
+class CoarseViews:
+    """The training views as a step looks at them: camera, and what to compare its image with."""
+
+    def __init__(self, views: ViewsInTurn, until: float) -> None:
+        self.views = views
+        self.until = until  # of the run
+        self.kept: dict[tuple[int, int], tuple[Camera, Target]] = {}
+
+    def look(self, view: int, camera: Camera, progress: float) -> tuple[Camera, Target]:
+        """At a `progress` of the run, 0 to 1; the target has the view's exposure where exposures are learned."""
+        times = halvings(progress, self.until, camera.width, camera.height)
+        if times == 0:
+            return camera, self.views.photograph(view)
+        small, target = self._halved(view, camera, times)
+        return small, self.views.with_exposure(view, target)
+
+    def _halved(self, view: int, camera: Camera, times: int) -> tuple[Camera, Target]:
+        kept, key = self.kept, (view, times)
+        if key not in kept:
+            width, height = (max(1, round(side / 2**times)) for side in (camera.width, camera.height))
+            target = smaller(self.views.stored(view), width, height)
+            bound = KEPT_BYTES - target.image.numel()
+            while kept and sum(t.image.numel() for _, t in kept.values()) > bound:
+                del kept[next(iter(kept))]
+            kept[key] = camera.resized(width, height), target
+        return kept[key]
+
+
+def smaller(photograph: Target, width: int, height: int) -> Target:
+    """Means over the pixels that become one. One counts if at least half of what it is made of does."""
+
+    def shrunk(image: Tensor) -> Tensor:  # [H, W, C]
+        small = nn.functional.interpolate(image.permute(2, 0, 1)[None].float(), (height, width), mode="area")
+        return small[0].permute(1, 2, 0)
+
+    image = shrunk(photograph.image).round().to(torch.uint8).contiguous()
+    counted = photograph.counted
+    if counted is not None:
+        counted = (shrunk(counted[..., None])[..., 0] >= 0.5).contiguous()
+    return replace(photograph, image=image, counted=counted)
