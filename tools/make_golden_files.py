@@ -41,6 +41,12 @@ ODD_GROUPS = (
     GroupShape(Role.RESIDUAL, 2, (1.0, 0.5), (2, 3, 6), sees_coordinates=True),
 )
 
+# As the default preset has them: nothing is known of a reference before it is decoded.
+CONSTANT_GROUPS = (
+    GroupShape(Role.REFERENCE, 12, (0.33,), (), sees_coordinates=True),
+    GroupShape(Role.LOG_SCALES, 6, DEFAULT_STEPS, (0,)),
+)
+
 VIEWPOINTS = Viewpoints(
     up=(0.0, -0.6, 0.8),
     views=(
@@ -57,16 +63,20 @@ TRAINED = ("trained",)
 
 
 def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
-    """Content and levels of the ranges, by name: the smallest sensible file, one as the default preset makes it, one as
-    the paper's preset does, one with everything unusual.
+    """Content and levels of the ranges, by name: the smallest sensible file, one of the paper's chain without residuals
+    of their own, one as the default preset makes it, one as the paper's preset does, one with everything unusual.
     """
     tiny = make_content(3, 1, make_dimensions(2, paper_groups(2, 0, 1), width=2, residual_dim=2), kept=0.7)
     default = make_content(800, 2, make_dimensions(5, paper_groups(12, 0)))
     shapes = [g.shape for g in default.groups]
     scales = replace(default.groups[2], shape=replace(shapes[2], steps=DEFAULT_STEPS))
     default = replace(default, groups=(*default.groups[:2], scales))
+    constant = make_content(300, 5, make_dimensions(5, CONSTANT_GROUPS))
+    for layer in constant.groups[0].prior.layers:
+        layer.weight[:] = 0
     paper = make_content(60, 4, make_dimensions(10, paper_groups(16, 4)), blocks=2, hidden=12)
-    return {"tiny": (tiny, None), "default": (default, None), "paper": (paper, None), "odd": odd()}
+    made = {"tiny": tiny, "default": default, "constant": constant, "paper": paper}
+    return {**{name: (content, None) for name, content in made.items()}, "odd": odd()}
 
 
 def odd() -> tuple[FileContent, list[int]]:
