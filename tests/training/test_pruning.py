@@ -14,7 +14,8 @@ from compgs.render import render
 from compgs.scene.views import Scene, View
 from compgs.tensors.contributions import contributions, signed_changes
 from compgs.tensors.rasterize import rasterize
-from compgs.training.pruning import paying, random_signs, squared_changes
+from compgs.training.coarse import halved
+from compgs.training.pruning import judged, paying, random_signs, squared_changes
 from compgs.training.rate_control import RateState
 from compgs.training.trainer import Trainer
 
@@ -108,7 +109,7 @@ def test_squared_changes_are_those_of_images_without_an_anchor(unequal: Trainer)
         expected += (of_anchors**2).sum(1)
     draws = [
         squared_changes(
-            [(number, views[0]), (number + 1000, views[1])],
+            [(number, views[0].camera), (number + 1000, views[1].camera)],
             unequal.predicted, unequal.shape, unequal.settings, CPU,
         ).numpy()
         for number in range(96)
@@ -122,10 +123,36 @@ def test_squared_changes_are_those_of_images_without_an_anchor(unequal: Trainer)
 
 def test_changes_are_a_mean_over_the_values_of_all_views(unequal: Trainer) -> None:
     views = unequal.scene.train_views
-    numbered = [(unequal.step * len(views) + i, view) for i, view in enumerate(views)]
+    numbered = [(unequal.step * len(views) + i, view.camera) for i, view in enumerate(views)]
     total = squared_changes(numbered, unequal.predicted, unequal.shape, unequal.settings, CPU)
     values = sum(view.image.size for view in views)
     assert torch.equal(unequal.changes(256), total / values)
+
+
+def test_large_views_are_judged_with_sides_halved(unequal: Trainer) -> None:
+    """Not below forty thousand pixels: what anchors change there is about what they change in the whole image."""
+    camera = unequal.scene.train_views[0].camera
+    sizes = [
+        judged(camera.resized(width, height)) for width, height in ((390, 400), (480, 359), (1920, 1080))
+    ]
+    assert [(c.width, c.height) for c in sizes] == [(390, 400), (240, 180), (480, 270)]
+    large = camera.resized(4 * camera.width, 4 * camera.height)
+    found = [
+        np.mean(
+            [
+                squared_changes(
+                    [(number, c)], unequal.predicted, unequal.shape, unequal.settings, CPU
+                ).numpy()
+                for number in range(64)
+            ],
+            0,
+        )
+        / (c.width * c.height)
+        for c in (large, halved(large, 1))
+    ]
+    order = [np.argsort(np.argsort(values)) for values in found]
+    assert np.corrcoef(order)[0, 1] > 0.95
+    assert found[1].sum() == pytest.approx(found[0].sum(), rel=0.25)
 
 
 def test_nobody_would_miss_an_anchor_in_front_of_another_of_the_same_color() -> None:

@@ -24,8 +24,17 @@ def halvings(progress: float, until: float, width: int, height: int) -> int:
     """How often a photograph of that size is halved at a `progress` of the run, 0 to 1."""
     if progress >= until:
         return 0
-    possible = int(math.log(max(1.0, width * height / COARSEST_PIXELS), 4))
-    return math.ceil(possible * (1 - progress / until))
+    return math.ceil(times_halved(width, height, COARSEST_PIXELS) * (1 - progress / until))
+
+
+def times_halved(width: int, height: int, least: int) -> int:
+    """How often both sides can be halved with `least` pixels left."""
+    return int(math.log(max(1.0, width * height / least), 4))
+
+
+def halved(camera: Camera, times: int) -> Camera:
+    """The same view with sides halved so many times."""
+    return camera.resized(*(max(1, round(side / 2**times)) for side in (camera.width, camera.height)))
 
 
 class CoarseViews:
@@ -47,12 +56,12 @@ class CoarseViews:
     def _halved(self, view: int, camera: Camera, times: int) -> tuple[Camera, Target]:
         kept, key = self.kept, (view, times)
         if key not in kept:
-            width, height = (max(1, round(side / 2**times)) for side in (camera.width, camera.height))
-            target = smaller(self.views.stored(view), width, height)
+            small = halved(camera, times)
+            target = smaller(self.views.stored(view), small.width, small.height)
             bound = KEPT_BYTES - target.image.numel()
             while kept and sum(t.image.numel() for _, t in kept.values()) > bound:
                 del kept[next(iter(kept))]
-            kept[key] = camera.resized(width, height), target
+            kept[key] = small, target
         return kept[key]
 
 

@@ -21,9 +21,9 @@ from compgs.cameras import Camera
 from compgs.config import ControlConfig
 from compgs.losses import RATE_PER_BIT
 from compgs.render import RasterSettings
-from compgs.scene.views import View
 from compgs.tensors.contributions import signed_changes
 from compgs.tensors.prediction import Prediction
+from compgs.training.coarse import COARSEST_PIXELS, halved, times_halved
 
 MOST = 0.5  # of the anchors, that one pruning takes: what replaces each other must not go together
 # A further pruning takes what the first would at a higher price, about: by then the others have taken over (plush_480
@@ -33,29 +33,34 @@ LATER = 0.2
 
 @torch.no_grad()
 def squared_changes(
-    views: Sequence[tuple[int, View]],  # with numbers that tell their draws apart
+    cameras: Sequence[tuple[int, Camera]],  # of views, with numbers that tell their draws apart
     predicted: Callable[[Camera], tuple[Tensor, Prediction] | None],
     shape: tuple[int, int],  # N, K
     settings: RasterSettings,
     device: torch.device,
 ) -> Tensor:  # [N] float64, 1 for a value that goes from 0 to 1
-    """Estimated squared changes of the views' images without an anchor, summed over all their values.
+    """Estimated squared changes of the cameras' images without an anchor, summed over all their values.
 
     `predicted`: for a camera, the visible anchors [V] and their prediction, or None if no anchor is visible.
     """
     total = torch.zeros(shape[0], dtype=torch.float64, device=device)
-    for number, view in views:
-        seen = predicted(view.camera)
+    for number, camera in cameras:
+        seen = predicted(camera)
         if seen is None:
             continue
         rows, prediction = seen
-        signs = random_signs(number, (view.camera.height, view.camera.width, 3), device)
-        changes = signed_changes(prediction.gaussians, view.camera, signs, settings).double()
+        signs = random_signs(number, (camera.height, camera.width, 3), device)
+        changes = signed_changes(prediction.gaussians, camera, signs, settings).double()
         # [V, K], so that an anchor's are summed in the same order everywhere
         slots = changes.new_zeros(len(rows) * shape[1])
         slots[prediction.index] = changes
         total[rows] += slots.view(len(rows), shape[1]).sum(1) ** 2
     return total
+
+
+def judged(camera: Camera) -> Camera:
+    """The view of a camera as anchors are judged by it: large ones with sides halved, in a fraction of the time."""
+    return halved(camera, times_halved(camera.width, camera.height, COARSEST_PIXELS))
 
 
 def random_signs(seed: int, shape: tuple[int, ...], device: torch.device) -> Tensor:

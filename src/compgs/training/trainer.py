@@ -80,7 +80,7 @@ from compgs.training.loop import (
 from compgs.training.network_size import head_bits
 from compgs.training.optimizers import DECAYS, make_optimizer, parameters_of, set_learning_rates, step_rows
 from compgs.training.profile import StepProfile
-from compgs.training.pruning import paying, squared_changes
+from compgs.training.pruning import judged, paying, squared_changes
 from compgs.training.rate_control import RateState
 from compgs.training.restoring import check_tensor, restore_chance, restore_statistics, restoring
 from compgs.training.seen_points import check_points_seen
@@ -435,13 +435,15 @@ class Trainer:
 
     def changes(self, most: int = LOOKED_AT) -> Tensor:
         """[N] float64: mean squared change of a value of the training views, or of at most `most` of them, without an
-        anchor.
+        anchor; of large ones with sides halved.
         """
-        views = spread(self.scene.train_views, most)
-        numbered = mine([(self.step * len(views) + number, view) for number, view in enumerate(views)])
+        cameras = [judged(view.camera) for view in spread(self.scene.train_views, most)]
+        numbered = mine(
+            [(self.step * len(cameras) + number, camera) for number, camera in enumerate(cameras)]
+        )
         total = squared_changes(numbered, self.predicted, self.shape, self.settings, self.device)
         sum_over_ranks(total)
-        return total / sum(3 * view.camera.width * view.camera.height for view in views)
+        return total / sum(3 * camera.width * camera.height for camera in cameras)
 
     @property
     def shape(self) -> tuple[int, int]:
