@@ -81,6 +81,8 @@ class ModelConfig:
     voxel_size: Annotated[float | None, Range(0, above=True)] = None
     # median distances of the points to a voxel, where voxel_size is not given
     voxel_spacings: Annotated[float, Range(0, 1e6, above=True, below=True)] = 1.5
+    # and voxels grow with this power of lambda / 0.002 above it (not in the paper; `training/grid.py`)
+    voxel_rate_exponent: Annotated[float, Range(0, 1)] = 1 / 6
     # anchors start with the colors of the points, in three channels of their references
     point_colors: bool = True
     # growth stops here

@@ -13,6 +13,7 @@ from compgs.scene.points import colors_at
 from compgs.scene.views import Scene
 from compgs.tensors.heads import make_heads
 from compgs.tensors.prediction import predict
+from compgs.training.grid import grid_spacings
 from compgs.training.initial import initial_model
 
 
@@ -96,3 +97,24 @@ def test_networks_are_random_by_the_seed_and_leave_other_chance_alone(
 def test_the_paper_preset_starts_from_references_of_zero(blob_scene: Scene) -> None:
     model = initial_model(blob_scene, load_config("paper"))
     assert not model.references.any()
+
+
+@pytest.mark.parametrize(
+    ("lmbda", "spacings"), [(1e-6, 1.5), (0.002, 1.5), (0.016, 2.1213), (0.1, 2.8789), (10.0, 2.8789)]
+)
+def test_voxels_are_larger_where_bits_are_dear(lmbda: float, spacings: float) -> None:
+    """By the sixth root of lambda / 0.002, as far as growth follows lambda."""
+    config = replace(Config(), training=replace(Config().training, lmbda=lmbda))
+    assert grid_spacings(config) == pytest.approx(spacings, rel=1e-4)
+    assert grid_spacings(replace(config, model=replace(config.model, voxel_rate_exponent=0.0))) == 1.5
+
+
+def test_a_run_starts_on_the_grid_that_its_lambda_asks_for(blob_scene: Scene, tiny_config: Config) -> None:
+    """But a voxel size that is given stays as it is."""
+    free = replace(tiny_config, model=replace(tiny_config.model, voxel_size=None))
+    sizes = []
+    for config in (free, tiny_config):
+        for lmbda in (0.002, 0.1):
+            dear = replace(config, training=replace(config.training, lmbda=lmbda))
+            sizes.append(initial_model(blob_scene, dear).voxel_size)
+    assert sizes[1] == pytest.approx(50 ** (1 / 6) * sizes[0]) and sizes[2:] == [0.1, 0.1]

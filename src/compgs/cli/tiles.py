@@ -99,10 +99,12 @@ def settings_of_tile(place: str) -> RunSettings:
 
 def _with_voxels(config: "Config", spacing: float) -> "Config":
     """Voxels as the tile's own points ask for: those outside are perhaps thinned out, and would ask for larger ones."""
+    from compgs.training.grid import grid_spacings
+
     m = config.model
-    return (
-        config if m.voxel_size else replace(config, model=replace(m, voxel_size=m.voxel_spacings * spacing))
-    )
+    if m.voxel_size:
+        return config
+    return replace(config, model=replace(m, voxel_size=grid_spacings(config) * spacing))
 
 
 def block(scene: "Scene", settings: RunSettings) -> "Scene":

@@ -13,6 +13,7 @@ from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
+from compgs.training.grid import grid_spacings
 from compgs.training.network_size import head_bits, hidden_width
 from compgs.training.own_residuals import own_residuals
 
@@ -26,7 +27,7 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
     A scene far from the world's origin gets a `world_offset`, from which its anchors are counted.
     Raises ConfigError if the voxel size that was asked for gives more than `max_anchors`.
     """
-    m = config.model
+    m = replace(config.model, voxel_spacings=grid_spacings(config))
     cameras = [view.camera for view in scene.train_views]
     offset = world_offset(scene)
     scene = local_scene(scene, offset)
