@@ -95,6 +95,7 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         "model.max_anchors": "a limit",
         "model.residuals_where_few": "anchors have their own",
         "model.residuals_where_many": "anchors have their own",
+        "model.separate_where_long": "they are separate",
         "entropy.network_bits": "how weights are stored",
         "entropy.head_bits": "how weights are stored",
         "control.start": "bounds of short runs",

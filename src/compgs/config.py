@@ -77,6 +77,9 @@ class ModelConfig:
     networks_by_price: bool = True
     # separate: four networks (Sec. 3.2); paired: geometry, appearance
     heads: Literal["separate", "paired"] = "paired"
+    # lambda up to which networks are separate in spite of it, in runs that pass over many views 45 times and more;
+    # 0: never (not in the paper)
+    separate_where_long: Annotated[float, Range(0, 100)] = 1e-5
     # world units between neighbouring anchors; None: from the points' spacing
     voxel_size: Annotated[float | None, Range(0, above=True)] = None
     # median distances of the points to a voxel, where voxel_size is not given

@@ -154,7 +154,11 @@ class TrainedModel(nn.Module):
         """As they are now."""
         m = self.config.model
         return ModelDimensions(
-            self.mask.shape[1], self.reference_dim, m.residual_dim, self.heads.dimensions.width, m.heads
+            self.mask.shape[1],
+            self.reference_dim,
+            m.residual_dim,
+            self.heads.dimensions.width,
+            self.heads.layout,
         )
 
     @property

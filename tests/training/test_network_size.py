@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from compgs.config import Config
-from compgs.training.network_size import head_bits, hidden_width
+from compgs.training.network_size import head_bits, head_layout, hidden_width
 
 
 def priced(config: Config, lmbda: float, **model: object) -> Config:
@@ -51,3 +51,26 @@ def test_a_size_that_is_asked_for_decides_whatever_lambda_begins_with() -> None:
             config = priced(Config(), lmbda)
             config = replace(config, training=replace(config.training, target_bytes=size))
             assert hidden_width(config, 5_000) == width
+
+
+@pytest.mark.parametrize(
+    ("views", "steps", "asked", "layout"),
+    [
+        (100, 4500, {"lmbda": 1e-5}, "separate"),
+        (100, 4499, {"lmbda": 1e-5}, "paired"),  # too short
+        (100, 4500, {"lmbda": 2e-5}, "paired"),  # bits cost
+        (12, 4500, {"lmbda": 1e-5}, "paired"),  # few views would be learned by heart
+        (100, 4500, {"lmbda": 0.002, "target_bytes": 80_000}, "separate"),
+        (100, 4500, {"lmbda": 1e-5, "target_bytes": 79_999}, "paired"),
+    ],
+)
+def test_networks_are_separate_at_the_top_of_long_runs(
+    views: int, steps: int, asked: dict[str, float], layout: str
+) -> None:
+    training = replace(Config().training, steps=steps, **asked)  # type: ignore[arg-type]
+    config = replace(Config(), training=training)
+    assert head_layout(config, 2000, views) == layout
+    never = replace(config, model=replace(config.model, separate_where_long=0.0))
+    assert head_layout(never, 2000, views) == "paired"
+    given = replace(never, model=replace(never.model, heads="separate"))
+    assert head_layout(given, 2000, views) == "separate"

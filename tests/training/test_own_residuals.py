@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from compgs.codec import encode
+from compgs.codec import decode, encode
 from compgs.config import Config, load_config
 from compgs.scene.views import Scene
 from compgs.training.checkpoint import load_checkpoint
 from compgs.training.own_residuals import own_residuals
-from compgs.training.trainer import train
+from compgs.training.trainer import Trainer, train
 
 
 def asked(**training: object) -> Config:
@@ -65,3 +65,20 @@ def test_a_run_with_few_views_trains_encodes_and_resumes_with_residuals_of_its_o
     assert (tmp_path / "a.cgs").read_bytes() == (tmp_path / "b.cgs").read_bytes()
     shared = train(blob_scene, replace(config, training=replace(config.training, lmbda=0.003)), device="cpu")
     assert not shared.own_residuals and len(shared.residuals) == 1
+
+
+def test_a_long_run_at_the_top_trains_encodes_and_resumes_with_separate_networks(
+    blob_scene: Scene, tiny_config: Config, tmp_path: Path
+) -> None:
+    model = replace(tiny_config.model, heads="paired", residuals=False)
+    config = replace(tiny_config, model=model, training=replace(tiny_config.training, steps=4, lmbda=1e-6))
+    many = replace(blob_scene, train_views=blob_scene.train_views * 4)
+    passes = replace(config, training=replace(config.training, steps=45 * len(many.train_views)))
+    trainer = Trainer(many, passes, torch.device("cpu"))
+    trainer.train_step()
+    assert trainer.model.dimensions.heads == "separate" and trainer.model.own_residuals
+    trainer.save(tmp_path / "checkpoint.safetensors")
+    restored = load_checkpoint(tmp_path / "checkpoint.safetensors").model
+    assert restored.dimensions.heads == "separate"
+    encode(restored, tmp_path / "a.cgs")
+    assert decode(tmp_path / "a.cgs").heads.layout == "separate"

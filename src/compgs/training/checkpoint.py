@@ -109,6 +109,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, writer: Writer | None = 
                 "world_offset": list(model.world_offset),
                 "width": model.dimensions.width,
                 "residuals": model.own_residuals,
+                "heads": model.dimensions.heads,
                 "head_bits": model.head_bits,
             }
         ),
@@ -178,7 +179,12 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     residuals = scene["residuals"]
     if not isinstance(residuals, bool):
         raise ValueError(f"residuals: expected true or false, found {residuals!r}")
-    made = replace(config.model, reference_dim=references.shape[1], width=width, residuals=residuals)
+    layout = scene["heads"]
+    if layout not in ("separate", "paired"):
+        raise ValueError(f"heads: expected separate or paired, found {layout!r}")
+    made = replace(
+        config.model, reference_dim=references.shape[1], width=width, residuals=residuals, heads=layout
+    )
     model = TrainedModel(
         config,
         coordinates,

@@ -14,6 +14,9 @@ FEW_ENOUGH = 0.5  # `fewness` from which on views are few here
 PASSES = (
     45  # over the training views, where these are many: 46 were enough, with 23 to 43 shared ones were better
 )
+# Of a file for each anchor of the beginning, where a size is asked for: from here on bits are as cheap as with a lambda
+# of 1e-5 (docs/log/2026-11-23-16-top.md).
+CHEAP_BYTES = 40
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Limits:
 
     lmbda: float
     # For each anchor of the beginning, where a file's size is asked for: what files had with that lambda
-    # (docs/log/2026-11-23-15-residuals.md, -16-top.md).
+    # (docs/log/2026-11-23-15-residuals.md).
     bytes: int
 
 
@@ -40,9 +43,15 @@ def own_residuals(config: Config, anchors: int, views: int) -> bool:
 
 
 def _limits(config: Config, views: int) -> Limits:
-    m, t = config.model, config.training
+    m = config.model
     if fewness(views) >= FEW_ENOUGH:
         return Limits(m.residuals_where_few, 12)
-    if t.steps * t.views_per_step >= PASSES * views:
-        return Limits(m.residuals_where_many, 40)
+    if long_run(config, views):
+        return Limits(m.residuals_where_many, CHEAP_BYTES)
     return Limits(0.0, 0)
+
+
+def long_run(config: Config, views: int) -> bool:
+    """Whether there is the time to learn what many views show beyond what all anchors can share."""
+    passes = config.training.steps * config.training.views_per_step / views
+    return fewness(views) < FEW_ENOUGH and passes >= PASSES
