@@ -72,8 +72,11 @@ class ModelConfig:
     residuals_where_many: Annotated[float, Range(0, 100)] = 1e-5
     # hidden width of the residual MLPs (Ref.)
     width: Annotated[int, Range(8, 256, multiple=8)] = 32
-    # networks are narrower, and their weights of fewer bits, than `width` and `head_bits` say where they would be a
-    # sixth of the file and more: a large lambda and few anchors, or a small file that is asked for (not in the paper)
+    # reference embeddings have a hyperprior (Sec. 3.3); else each of their channels is coded around one mean
+    hyperprior: bool = True
+    # networks are narrower, their weights of fewer bits, than `width` and `head_bits` say, and there is no hyperprior,
+    # where networks would be a sixth of the file and more: a large lambda and few anchors, or a small file that is
+    # asked for (not in the paper)
     networks_by_price: bool = True
     # separate: four networks (Sec. 3.2); paired: geometry, appearance
     heads: Literal["separate", "paired"] = "paired"
@@ -96,9 +99,8 @@ class ModelConfig:
 class EntropyConfig:
     """Quantization and rate (Sec. 3.3)."""
 
-    # hyperprior channels of a reference embedding (Ref.: 4); 0: none, 2 to 5 % smaller files where references are in
-    # their principal axes (not in the paper)
-    reference_hyper_dim: Annotated[int, Range(0, 64)] = 0
+    # hyperprior channels of a reference embedding, where it has one (Ref.)
+    reference_hyper_dim: Annotated[int, Range(1, 64)] = 4
     # quantization step of reference embeddings (1 in Sec. 3.4 costs 0.5 dB in short runs)
     reference_step: Annotated[float, Range(0, 1e3, above=True, below=True)] = 0.33
     # quantization step of residual embeddings (1 in Sec. 3.4)

@@ -25,9 +25,12 @@ from compgs.training.decorrelation import keep_channels
 OWN_RESIDUALS = Config(model=ModelConfig(residuals=True))
 
 
-def entropy_of(blocks: int, width: int = 16) -> EntropyConfig:
-    """The paper's kind of entropy model with blocks; the default's, without hyperprior, without them."""
-    return EntropyConfig(reference_hyper_dim=4 if blocks else 0, network_blocks=blocks, network_width=width)
+def config_of(blocks: int, residuals: bool = True, width: int = 16) -> Config:
+    """The paper's kind of entropy model with blocks; that of small files, without hyperprior, without them."""
+    return Config(
+        model=ModelConfig(residuals=residuals, hyperprior=blocks > 0),
+        entropy=EntropyConfig(network_blocks=blocks, network_width=width),
+    )
 
 
 def made_model(anchors: int = 400, seed: int = 0, config: Config | None = None) -> TrainedModel:
@@ -53,8 +56,7 @@ def by_position(primitives) -> dict[tuple[int, ...], int]:
 @pytest.mark.parametrize("blocks", [0, 2])
 @pytest.mark.parametrize("residuals", [True, False])
 def test_the_decoded_scene_is_the_one_that_training_rendered(tmp_path, blocks, residuals):
-    config = Config(model=ModelConfig(residuals=residuals), entropy=entropy_of(blocks))
-    model = made_model(config=config)
+    model = made_model(config=config_of(blocks, residuals))
     with torch.no_grad():
         model.entropy.log_covariance_step.add_(torch.linspace(-0.5, 0.5, 6))  # six steps
     encode(model, tmp_path / "a.cgs")
@@ -82,7 +84,7 @@ def test_the_decoded_scene_is_the_one_that_training_rendered(tmp_path, blocks, r
 @pytest.mark.parametrize("blocks", [0, 2])
 def test_bits_match_the_files_sections_within_one_percent(blocks):
     """Streams above 10 kB."""
-    model = made_model(7000, config=replace(OWN_RESIDUALS, entropy=entropy_of(blocks)))
+    model = made_model(7000, config=config_of(blocks))
     with torch.no_grad():
         for hyperprior in (model.entropy.reference_context, model.entropy.residual_hyperprior):
             if isinstance(hyperprior, Hyperprior):
@@ -209,12 +211,12 @@ def test_shared_residuals_are_in_the_file_though_no_symbol_is(tmp_path):
     assert np.array_equal(decoded, model.as_hybrid_model().primitives.residuals)
     info = file_info((tmp_path / "a.cgs").read_bytes())
     assert not [s.name for s in info.sections if s.name.startswith("residual")]
-    assert [g.role for g in info.dimensions.groups] == [Role.REFERENCE, Role.LOG_SCALES]
+    assert [g.role for g in info.dimensions.groups] == [Role.SIDE, Role.REFERENCE, Role.LOG_SCALES]
 
 
 def test_without_a_hyperprior_each_channel_of_the_references_has_one_mean_and_one_scale():
     """A network on the anchors' coordinates, of zeros, which take no byte each."""
-    config = Config(entropy=EntropyConfig(reference_hyper_dim=0))
+    config = Config(model=ModelConfig(hyperprior=False))
     content = to_content(made_model(2000, config=config))
     references, log_scales = content.groups
     assert (references.shape.role, references.shape.context) == (Role.REFERENCE, ())
@@ -312,8 +314,7 @@ def test_the_network_that_is_trained_is_the_one_in_the_file(blocks, bits):
 
 def test_an_entropy_model_of_every_kind_is_written_as_the_paper_has_it():
     """Roles, contexts and shapes of networks: residual MLPs of so many blocks, references as context."""
-    config = replace(OWN_RESIDUALS, entropy=entropy_of(blocks=2, width=12))
-    content = to_content(made_model(50, config=config))
+    content = to_content(made_model(50, config=config_of(blocks=2, width=12)))
     assert not any(g.shape.sees_coordinates for g in content.groups)
     assert [(g.shape.role, g.shape.context) for g in content.groups] == [
         (Role.SIDE, ()),

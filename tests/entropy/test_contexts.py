@@ -5,13 +5,13 @@ from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy.gaussian import scale_from_index
 from compgs.entropy.models import make_entropy_model
 
-MODEL = ModelConfig(coupled_primitives=3, reference_dim=6, residual_dim=4)
+MODEL = ModelConfig(hyperprior=False, coupled_primitives=3, reference_dim=6, residual_dim=4)
 
 
 @pytest.fixture
 def entropy():
     torch.manual_seed(0)
-    return make_entropy_model(MODEL, EntropyConfig(reference_hyper_dim=0))
+    return make_entropy_model(MODEL, EntropyConfig())
 
 
 def test_without_a_hyperprior_nothing_is_sent_before_the_references(entropy):

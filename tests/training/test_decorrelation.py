@@ -73,7 +73,7 @@ def test_what_the_entropy_model_expects_turns_with_the_references(
     """Means of references, covariances and residuals from unrounded contexts: of covariances and residuals the same
     numbers, of references the same vectors in other axes.
     """
-    trainer = trained(blob_scene, tiny_config, reference_hyper_dim=4)
+    trainer = trained(blob_scene, tiny_config)
     model, entropy = trainer.model, trainer.model.entropy
 
     def expected() -> tuple[torch.Tensor, ...]:
@@ -147,7 +147,7 @@ def test_where_axes_only_change_places_moments_go_along(blob_scene: Scene, tiny_
 
 
 def test_scales_that_start_anew_have_no_momentum(blob_scene: Scene, tiny_config: Config) -> None:
-    trainer = trained(blob_scene, tiny_config, reference_hyper_dim=4)
+    trainer = trained(blob_scene, tiny_config)
     network, c = trainer.model.entropy.reference_network, trainer.model.reference_dim
     for parameter in (network.weights[-1], network.biases[-1]):
         assert trainer.optimizer.state[parameter]["exp_avg"][c:].any()
@@ -271,7 +271,7 @@ def test_a_file_of_fewer_channels_decodes_to_the_trained_latents(
 
 def test_the_channels_that_stay_keep_their_means_and_scales(blob_scene: Scene, tiny_config: Config) -> None:
     """Of the references themselves: their network has the means of all channels, then all scales."""
-    trainer = trained(blob_scene, tiny_config, steps=8, reference_hyper_dim=4)
+    trainer = trained(blob_scene, tiny_config, steps=8)
     model, network = trainer.model, trainer.model.entropy.reference_network
     kept = torch.tensor([False, True, False, True, True, True, True, True])
     inputs = model.entropy.reference_context.outputs

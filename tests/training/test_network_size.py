@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from compgs.config import Config
-from compgs.training.network_size import head_bits, head_layout, hidden_width
+from compgs.training.network_size import has_hyperprior, head_bits, head_layout, hidden_width
 
 
 def priced(config: Config, lmbda: float, **model: object) -> Config:
@@ -74,3 +74,16 @@ def test_networks_are_separate_at_the_top_of_long_runs(
     assert head_layout(never, 2000, views) == "paired"
     given = replace(never, model=replace(never.model, heads="separate"))
     assert head_layout(given, 2000, views) == "separate"
+
+
+def test_there_is_a_hyperprior_where_networks_are_as_wide_as_they_are_asked_to_be() -> None:
+    for lmbda in (1e-6, 1e-3, 5e-3, 1e-2, 0.1):
+        config = priced(Config(), lmbda)
+        assert has_hyperprior(config, 6000) == (hidden_width(config, 6000) == 32)
+        assert not has_hyperprior(priced(Config(), lmbda, hyperprior=False), 6000)
+        fixed = replace(config, model=replace(config.model, networks_by_price=False))
+        assert has_hyperprior(fixed, 6000)
+    for size, kept in ((9_000, False), (26_000, False), (26_001, True)):
+        asked = replace(Config(), training=replace(Config().training, target_bytes=size))
+        assert has_hyperprior(asked, 6000) == kept
+    assert has_hyperprior(priced(Config(), 1e-6, width=8), 6000), "narrow, but not for the price of a bit"

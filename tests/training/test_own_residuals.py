@@ -67,6 +67,30 @@ def test_a_run_with_few_views_trains_encodes_and_resumes_with_residuals_of_its_o
     assert not shared.own_residuals and len(shared.residuals) == 1
 
 
+def test_a_run_for_a_small_file_trains_resumes_and_encodes_without_a_hyperprior(
+    blob_scene: Scene, tiny_config: Config, tmp_path: Path
+) -> None:
+    model = replace(tiny_config.model, networks_by_price=True)
+    config = replace(tiny_config, model=model, training=replace(tiny_config.training, lmbda=0.05))
+    whole = Trainer(blob_scene, config, torch.device("cpu"))
+    assert not whole.model.entropy.has_hyperprior
+    whole.run(None, None)
+    first = Trainer(blob_scene, config, torch.device("cpu"))
+    for _ in range(15):
+        first.train_step()
+    first.save(tmp_path / "checkpoint.safetensors")
+    second = Trainer.resumed(blob_scene, tmp_path / "checkpoint.safetensors", config, torch.device("cpu"))
+    second.run(None, None)
+    for name, value in whole.model.state_dict().items():
+        assert torch.equal(value, second.model.state_dict()[name]), name
+    encode(second.model, tmp_path / "a.cgs")
+    trained = second.model.as_hybrid_model().primitives
+    decoded = decode(tmp_path / "a.cgs").primitives
+    assert sorted(decoded.references.sum(1).tolist()) == pytest.approx(
+        sorted(trained.references.sum(1).tolist()), abs=1e-3
+    )
+
+
 def test_a_long_run_at_the_top_trains_encodes_and_resumes_with_separate_networks(
     blob_scene: Scene, tiny_config: Config, tmp_path: Path
 ) -> None:

@@ -75,7 +75,7 @@ def test_the_loss_of_a_step_is_its_formula(
     t = config.training
     l1, similarity, volume, bits = parts_of_loss(trainer, trainer.scene.train_views[2])
     # of this model's streams: one hyperprior channel a primitive, 4 primitives of 8 residual channels
-    elements = {"reference": 8, "covariance": 6}
+    elements = {"reference_hyper": config.entropy.reference_hyper_dim, "reference": 8, "covariance": 6}
     elements |= {"residual_hyper": 4, "residual": 32}
     if t.rate == "elements":
         rate = sum(bits[name] / elements[name] for name in elements)

@@ -70,7 +70,7 @@ class EntropyModel(nn.Module):
         self.slots = model.coupled_primitives
         self.residual_channels = model.coupled_primitives * model.residual_dim
         shape = entropy.network_blocks, entropy.network_width
-        hyper = entropy.reference_hyper_dim
+        hyper = entropy.reference_hyper_dim if model.hyperprior else 0
         self.reference_context: Hyperprior | NoContext = (
             Hyperprior("reference_hyper", model.reference_dim, hyper) if hyper else NoContext()
         )
@@ -84,6 +84,11 @@ class EntropyModel(nn.Module):
             model.reference_dim, 6, *shape, mean_gain=1.0 / entropy.covariance_step
         )
         self.log_covariance_step = nn.Parameter(torch.full((6,), entropy.covariance_step).log())
+
+    @property
+    def has_hyperprior(self) -> bool:
+        """Of the references."""
+        return isinstance(self.reference_context, Hyperprior)
 
     @property
     def covariance_step(self) -> Tensor:

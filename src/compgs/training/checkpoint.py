@@ -110,6 +110,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, writer: Writer | None = 
                 "width": model.dimensions.width,
                 "residuals": model.own_residuals,
                 "heads": model.dimensions.heads,
+                "hyperprior": model.entropy.has_hyperprior,
                 "head_bits": model.head_bits,
             }
         ),
@@ -176,15 +177,14 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     red, green, blue = finite(scene["background"], 3, "background")
     x, y, z = finite(scene["world_offset"], 3, "world_offset")
     width = whole_number(scene["width"], 1, config.model.width, "width")
-    residuals = scene["residuals"]
-    if not isinstance(residuals, bool):
-        raise ValueError(f"residuals: expected true or false, found {residuals!r}")
+    flags = {name: scene[name] for name in ("residuals", "hyperprior")}
+    for name, value in flags.items():
+        if not isinstance(value, bool):
+            raise ValueError(f"{name}: expected true or false, found {value!r}")
     layout = scene["heads"]
     if layout not in ("separate", "paired"):
         raise ValueError(f"heads: expected separate or paired, found {layout!r}")
-    made = replace(
-        config.model, reference_dim=references.shape[1], width=width, residuals=residuals, heads=layout
-    )
+    made = replace(config.model, reference_dim=references.shape[1], width=width, heads=layout, **flags)
     model = TrainedModel(
         config,
         coordinates,

@@ -20,14 +20,24 @@ SHORTER = ((3e-6, 1), (3e-5, 2))
 
 def hidden_width(config: Config, anchors: int) -> int:
     """Hidden units of the networks of a run that starts with so many anchors; at most `model.width`."""
+    return min([config.model.width, *_narrower(config, anchors)])
+
+
+def has_hyperprior(config: Config, anchors: int) -> bool:
+    """Whether a run that starts with so many anchors has one: not where networks are narrower. In their principal axes
+    references have so little in common that it hardly saves what it costs, and its network and tables cost, too.
+    """
+    return config.model.hyperprior and not _narrower(config, anchors)
+
+
+def _narrower(config: Config, anchors: int) -> list[int]:
+    """Hidden units that the price of a bit, or the size that is asked for, leaves to the networks."""
     t = config.training
     if not config.model.networks_by_price:
-        return config.model.width
+        return []
     if t.target_bytes is not None:
-        narrower = [width for size, width in WIDTHS_OF_SIZES if t.target_bytes <= size]
-    else:
-        narrower = [width for price, width in WIDTHS if t.lmbda >= price * anchors]
-    return min([config.model.width, *narrower])
+        return [width for size, width in WIDTHS_OF_SIZES if t.target_bytes <= size]
+    return [width for price, width in WIDTHS if t.lmbda >= price * anchors]
 
 
 def head_bits(config: Config, lmbda: float, anchors: int) -> int:
