@@ -177,7 +177,9 @@ def test_files_of_methods_say_where_their_positions_count_from(
         write(train(scene, quick(method), method=method, device="cpu"), path, method=method)
         shown.append(render(open_scene(path), scene.test_views[0].camera).image)
     assert open_scene(path).world_offset[0] > 9e5
-    assert np.abs(shown[0] - shown[1]).mean() < 0.03 < shown[0].mean()
+    # Two trainings that round differently: alike, as pictures of different places would not be.
+    assert shown[0].mean() > 0.03
+    assert np.corrcoef(shown[0].ravel(), shown[1].ravel())[0, 1] > 0.8
 
 
 def test_a_checkpoint_of_another_method_is_not_continued(blob_scene: Scene, tmp_path: Path) -> None:
