@@ -41,7 +41,7 @@ ODD_GROUPS = (
     GroupShape(Role.RESIDUAL, 2, (1.0, 0.5), (2, 3, 6), sees_coordinates=True),
 )
 
-# As the default preset has them: nothing is known of a reference before it is decoded.
+# As the default preset has them in small files: nothing is known of a reference before it is decoded.
 CONSTANT_GROUPS = (
     GroupShape(Role.REFERENCE, 12, (0.33,), (), sees_coordinates=True),
     GroupShape(Role.LOG_SCALES, 6, DEFAULT_STEPS, (0,)),
@@ -63,8 +63,8 @@ TRAINED = ("trained",)
 
 
 def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
-    """Content and levels of the ranges, by name: the smallest sensible file, one of the paper's chain without residuals
-    of their own, one as the default preset makes it, one as the paper's preset does, one with everything unusual.
+    """Content and levels of the ranges, by name: the smallest sensible file, one as the default preset makes it, one as
+    it makes small ones, one as the paper's preset does, one with everything unusual.
     """
     tiny = make_content(3, 1, make_dimensions(2, paper_groups(2, 0, 1), width=2, residual_dim=2), kept=0.7)
     default = make_content(800, 2, make_dimensions(5, paper_groups(12, 0)))
