@@ -60,6 +60,7 @@ def test_a_size_that_is_asked_for_decides_whatever_lambda_begins_with() -> None:
         (100, 4499, {"lmbda": 1e-5}, "paired"),  # too short
         (100, 4500, {"lmbda": 2e-5}, "paired"),  # bits cost
         (12, 4500, {"lmbda": 1e-5}, "paired"),  # few views would be learned by heart
+        (0, 4500, {"lmbda": 1e-5}, "paired"),
         (100, 4500, {"lmbda": 0.002, "target_bytes": 80_000}, "separate"),
         (100, 4500, {"lmbda": 1e-5, "target_bytes": 79_999}, "paired"),
     ],

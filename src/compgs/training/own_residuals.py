@@ -53,5 +53,5 @@ def _limits(config: Config, views: int) -> Limits:
 
 def long_run(config: Config, views: int) -> bool:
     """Whether there is the time to learn what many views show beyond what all anchors can share."""
-    passes = config.training.steps * config.training.views_per_step / views
-    return fewness(views) < FEW_ENOUGH and passes >= PASSES
+    looked_at = config.training.steps * config.training.views_per_step
+    return fewness(views) < FEW_ENOUGH and looked_at >= PASSES * views
