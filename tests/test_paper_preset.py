@@ -67,6 +67,7 @@ PUBLISHED = {
     "training.hard_rate": 1.0,
     "training.left_out": 0.0,
     "training.coarse_until": 0.0,
+    "training.rate_every": 1,
 }
 
 

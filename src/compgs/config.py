@@ -189,6 +189,9 @@ class TrainingConfig:
     rate: Literal["bits", "elements"] = "bits"
     # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
     rate_start: Share = 0.1
+    # steps between two of which the rate is in the loss, as many times as steps pass: the latents change little from
+    # one to the next, and a step without it takes a tenth less time (not in the paper)
+    rate_every: Annotated[int, Range(1, 1000)] = 2
     # of the steps until which photographs of 160 000 pixels and more are halved, larger ones more than once; 0: never
     # (not in the paper; `training/coarse.py`)
     coarse_until: Share = 0.7

@@ -15,6 +15,7 @@ from compgs.scene.views import Scene, View
 from compgs.tensors.contributions import contributions, signed_changes
 from compgs.tensors.rasterize import rasterize
 from compgs.training.coarse import halved
+from compgs.training.importance import views_to_prune_by
 from compgs.training.pruning import judged, paying, random_signs, squared_changes
 from compgs.training.rate_control import RateState
 from compgs.training.trainer import Trainer
@@ -111,7 +112,7 @@ def test_squared_changes_are_those_of_images_without_an_anchor(unequal: Trainer)
         squared_changes(
             [(number, views[0].camera), (number + 1000, views[1].camera)],
             unequal.predicted, unequal.shape, unequal.settings, CPU,
-        ).numpy()
+        )[0].numpy()
         for number in range(96)
     ]  # fmt: skip
     found = np.mean(draws, 0)
@@ -124,9 +125,29 @@ def test_squared_changes_are_those_of_images_without_an_anchor(unequal: Trainer)
 def test_changes_are_a_mean_over_the_values_of_all_views(unequal: Trainer) -> None:
     views = unequal.scene.train_views
     numbered = [(unequal.step * len(views) + i, view.camera) for i, view in enumerate(views)]
-    total = squared_changes(numbered, unequal.predicted, unequal.shape, unequal.settings, CPU)
+    total, _ = squared_changes(numbered, unequal.predicted, unequal.shape, unequal.settings, CPU)
     values = sum(view.image.size for view in views)
     assert torch.equal(unequal.changes(256), total / values)
+
+
+def test_what_only_views_see_that_are_not_asked_outlasts_a_pruning(unequal: Trainer) -> None:
+    """Of a view that looks away nothing is known, nor of what only others show; what no view shows is worth nothing."""
+    away = unequal.scene.train_views[0].camera
+    away = replace(away, world_to_camera=np.diag([-1.0, 1.0, -1.0, 1.0]) @ away.world_to_camera)
+    asked = replace(unequal.scene.train_views[0], camera=away)
+    unequal.scene = replace(unequal.scene, train_views=(asked, unequal.scene.train_views[1]))
+    hidden = np.ones(unequal.model.anchors, bool)
+    hidden[unequal.visible_anchors(away).numpy()] = False
+    assert hidden.any()
+    assert (np.isinf(unequal.changes(1).numpy()) == hidden).all()
+    bits = torch.ones(unequal.model.anchors)
+    assert paying(unequal.changes(1), bits, 0.1, unequal.config.control, 0.0).numpy()[hidden].all()
+    assert torch.isfinite(unequal.changes(2)).all()
+
+
+@pytest.mark.parametrize(("views", "asked"), [(12, 48), (81, 48), (97, 49), (300, 150), (1000, 256)])
+def test_a_pruning_asks_half_of_the_views_but_some_at_least(views: int, asked: int) -> None:
+    assert views_to_prune_by(views) == asked
 
 
 def test_large_views_are_judged_with_sides_halved(unequal: Trainer) -> None:
@@ -140,9 +161,9 @@ def test_large_views_are_judged_with_sides_halved(unequal: Trainer) -> None:
     found = [
         np.mean(
             [
-                squared_changes(
-                    [(number, c)], unequal.predicted, unequal.shape, unequal.settings, CPU
-                ).numpy()
+                squared_changes([(number, c)], unequal.predicted, unequal.shape, unequal.settings, CPU)[
+                    0
+                ].numpy()
                 for number in range(64)
             ],
             0,

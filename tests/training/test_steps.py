@@ -17,7 +17,7 @@ from compgs.training.trainer import Trainer
 CPU = torch.device("cpu")
 STEPS = 20
 # Nothing is left to chance: no primitive is left out, and from the first step on the likelihood sees symbols.
-CERTAIN = {"steps": STEPS, "left_out": 0.0, "hard_rate": 0.0, "rate_start": 0.0}
+CERTAIN = {"steps": STEPS, "left_out": 0.0, "hard_rate": 0.0, "rate_start": 0.0, "rate_every": 1}
 
 
 def with_training(config: Config, **settings: object) -> Config:
@@ -211,3 +211,19 @@ def test_views_come_once_each_before_any_comes_again(blob_scene: Scene, tiny_con
         shown += [i for i, v in enumerate(blob_scene.train_views) if (v.image == photograph).all()]
     assert sorted(shown[:8]) == sorted(shown[8:]) == list(range(8))
     assert shown[:8] != shown[8:]
+
+
+def test_the_rate_is_in_the_loss_of_every_few_steps_as_many_times(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    found = {}
+    for every in (1, 3):
+        config = with_training(tiny_config, **{**CERTAIN, "rate_every": every, "lmbda": 10.0})
+        for step in (2, 3, 4):
+            trainer = started(blob_scene, config, step)
+            l1, similarity, _, _ = parts_of_loss(trainer, trainer.scene.train_views[2])
+            found[every, step] = float(trainer.train_step().loss) - 0.8 * l1 - 0.2 * (1 - similarity)
+    assert found[3, 3] == pytest.approx(3 * found[1, 3], rel=1e-3)
+    assert found[1, 3] > 1
+    for step in (2, 4):
+        assert abs(found[3, step]) < 0.01 * found[1, step]

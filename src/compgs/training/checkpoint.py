@@ -36,7 +36,7 @@ from compgs.training.restoring import (
 )
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
-CHECKPOINT_VERSION = "5"
+CHECKPOINT_VERSION = "6"
 
 
 @dataclass(frozen=True)

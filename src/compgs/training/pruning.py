@@ -38,12 +38,14 @@ def squared_changes(
     shape: tuple[int, int],  # N, K
     settings: RasterSettings,
     device: torch.device,
-) -> Tensor:  # [N] float64, 1 for a value that goes from 0 to 1
-    """Estimated squared changes of the cameras' images without an anchor, summed over all their values.
+) -> tuple[Tensor, Tensor]:  # [N] float64, 1 for a value that goes from 0 to 1; [N] float64 cameras
+    """Estimated squared changes of the cameras' images without an anchor, summed over all their values; and how many of
+    the cameras may show the anchor.
 
     `predicted`: for a camera, the visible anchors [V] and their prediction, or None if no anchor is visible.
     """
     total = torch.zeros(shape[0], dtype=torch.float64, device=device)
+    shown_by = torch.zeros_like(total)
     for number, camera in cameras:
         seen = predicted(camera)
         if seen is None:
@@ -55,7 +57,8 @@ def squared_changes(
         slots = changes.new_zeros(len(rows) * shape[1])
         slots[prediction.index] = changes
         total[rows] += slots.view(len(rows), shape[1]).sum(1) ** 2
-    return total
+        shown_by[rows] += 1
+    return total, shown_by
 
 
 def judged(camera: Camera) -> Camera:
@@ -75,7 +78,7 @@ def bit_price(lmbda: float, anchors: int) -> float:
 
 
 def paying(
-    changes: Tensor,  # [N] mean squared change of a value of the training views
+    changes: Tensor,  # [N] mean squared change of a value of the training views; infinite: not known
     bits: Tensor,  # [N] of each anchor
     lmbda: float,
     control: ControlConfig,

@@ -65,7 +65,7 @@ from compgs.training.dropout import thinned
 from compgs.training.events import Event, at_shares
 from compgs.training.few_views import fewness
 from compgs.training.file_size import anchor_bits, fixed_bytes
-from compgs.training.importance import LOOKED_AT, PRUNED_BY, missed, spread, view_contributions
+from compgs.training.importance import LOOKED_AT, missed, spread, view_contributions, views_to_prune_by
 from compgs.training.initial import initial_model
 from compgs.training.loop import (
     Run,
@@ -258,10 +258,17 @@ class Trainer:
         t = self.config.training
         return self.model.quantized(
             looks.own.rows,
-            rate=self.progress >= t.rate_start,
+            rate=self.rate_weight > 0,
             noise=looks.noise_of_latents() if self.progress < t.hard_rate else None,
             stored_weights=self.stored,
         )
+
+    @property
+    def rate_weight(self) -> int:
+        """How many steps the rate of this one stands for: it is in the loss of every few, as many times."""
+        t = self.config.training
+        counted = self.progress >= t.rate_start and self.step % t.rate_every == 0
+        return t.rate_every if counted else 0
 
     @property
     def stored(self) -> bool:
@@ -309,12 +316,15 @@ class Trainer:
         return self.config.training.scale_weight * volumes + vanishing_loss(prediction)
 
     def rate_of(self, latents: Quantized, looks: StepViews) -> Tensor | None:
-        """R of Eq. 1, summed over this rank's views; None before the rate joins the loss."""
+        """R of Eq. 1, summed over this rank's views, and over the steps that it stands for; None where it is not in the
+        loss.
+        """
         if not latents.bits:
             return None
         channels, normalization = self.model.entropy.channels, self.config.training.rate
         parts = [latents.of(looks.own.part_of(number)).bits for number in looks.own.numbers]
-        return torch.stack([rate(bits, channels, normalization) for bits in parts]).sum()
+        rates = [rate(bits, channels, normalization) for bits in parts]
+        return self.rate_weight * torch.stack(rates).sum()
 
     def backward(self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians) -> None:
         """Compute a view's gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
@@ -411,7 +421,8 @@ class Trainer:
 
     def prune(self) -> None:
         """Remove the anchors that are not worth their bits: what is left of the run makes up for them."""
-        changes, bits = self.changes(PRUNED_BY), anchor_bits(self.model)
+        changes = self.changes(views_to_prune_by(len(self.scene.train_views)))
+        bits = anchor_bits(self.model)
         lmbda, (least, most) = self.rate.lmbda_of_pruning, self.target_size.bits_that_stay(self.step, bits)
         kept = paying(changes, bits, lmbda, self.config.control, self.few, least_bits=least, most_bits=most)
         if kept.any():
@@ -435,14 +446,18 @@ class Trainer:
 
     def changes(self, most: int = LOOKED_AT) -> Tensor:
         """[N] float64: mean squared change of a value of the training views, or of at most `most` of them, without an
-        anchor; of large ones with sides halved.
+        anchor; of large ones with sides halved. Infinite: none of these may show the anchor, but another view might.
         """
-        cameras = [judged(view.camera) for view in spread(self.scene.train_views, most)]
+        views = self.scene.train_views
+        cameras = [judged(view.camera) for view in spread(views, most)]
         numbered = mine(
             [(self.step * len(cameras) + number, camera) for number, camera in enumerate(cameras)]
         )
-        total = squared_changes(numbered, self.predicted, self.shape, self.settings, self.device)
+        total, shown_by = squared_changes(numbered, self.predicted, self.shape, self.settings, self.device)
         sum_over_ranks(total)
+        sum_over_ranks(shown_by)
+        if len(cameras) < len(views):
+            total[shown_by == 0] = math.inf
         return total / sum(3 * camera.width * camera.height for camera in cameras)
 
     @property
