@@ -63,7 +63,10 @@ def of_one_rank(rank: int, anchors: int, repeats: int, folder: Path) -> dict[str
         parameter.grad = torch.randn_like(parameter)
     parameters = list(model.parameters())
     control = AdaptiveControl(
-        config, make_schedule(config.control, 30_000, 200), anchors, torch.device("cpu")
+        config,
+        make_schedule(config.control, 30_000, 200),
+        (anchors, config.model.coupled_primitives),
+        torch.device("cpu"),
     )
     gradient_bytes = sum(4 * p.numel() for p in parameters)
     statistics = AdaptiveControl.STATISTICS

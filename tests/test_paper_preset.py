@@ -59,6 +59,7 @@ PUBLISHED = {
     "training.covariance_lr": (4e-3, 4e-5),
     "training.opacity_lr": (2e-3, 2e-5),
     "training.color_lr": (8e-3, 8e-5),
+    "model.twice_coupled_where_few": 0.0,
     "model.networks_by_price": False,
     "training.entropy_lr": (2e-4, 1e-5),
     "training.anchor_memory": 1000.0,  # Adam's beta of squared gradients: 0.999

@@ -59,6 +59,9 @@ class ModelConfig:
 
     # K, per anchor (10 in Sec. 3.4: slower, and no better at the same size)
     coupled_primitives: Annotated[int, Range(1, 64)] = 5
+    # lambda up to which K is twice that, where training views are few (22 and fewer): texture that no smaller lambda
+    # brings there; 0: never (not in the paper)
+    twice_coupled_where_few: Annotated[float, Range(0, 100)] = 1e-4
     # channels of a reference embedding (Sec. 3.4)
     reference_dim: Annotated[int, Range(1, 256)] = 32
     # channels of a residual embedding (Sec. 3.4)

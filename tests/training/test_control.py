@@ -121,7 +121,7 @@ def test_statistics_follow_the_anchors(blob_scene, tiny_config):
     """Through pruning: those that stay keep theirs, row by row."""
     model = initial_model(blob_scene, tiny_config)
     n, k = model.anchors, 4
-    control = AdaptiveControl(tiny_config, make_schedule(tiny_config.control, 40, 8), n, CPU)
+    control = AdaptiveControl(tiny_config, make_schedule(tiny_config.control, 40, 8), (n, k), CPU)
     filled = {
         "gradient": torch.arange(n * k, dtype=torch.float32).view(n, k),
         "drawn": torch.arange(n * k, dtype=torch.float32).view(n, k) + 0.25,
@@ -282,7 +282,7 @@ def judges(control: ControlConfig, schedule: ControlSchedule, sightings: int) ->
     """Whether a primitive seen so often is judged: with so large a gradient, it then asks for an anchor."""
     certain = replace(control, growth_probabilities=(1.0, 1.0, 1.0))
     model = made_model([[0, 0, 0], [500, 0, 0]], [[0.0] * 3] * 2, certain)
-    statistics = AdaptiveControl(model.config, schedule, 2, CPU)
+    statistics = AdaptiveControl(model.config, schedule, (2, K), CPU)
     statistics.drawn[0, 0], statistics.gradient[0, 0] = sightings, 1e3
     act(statistics, model, means=[[[100.0] * 3] * K, [[250.0, 0.0, 0.0]] * K])
     return model.anchors > 2
@@ -304,7 +304,7 @@ LONG = ControlSchedule(start=100, stop=1_000, every=100)
 
 def with_gradients(model: TrainedModel, means: list[list[float]], views: float = 10.0) -> AdaptiveControl:
     """Control that has seen every primitive in so many views, with these mean gradients [N][K]."""
-    control = AdaptiveControl(model.config, LONG, model.anchors, CPU)
+    control = AdaptiveControl(model.config, LONG, (model.anchors, K), CPU)
     control.drawn[:] = views
     control.gradient[:] = torch.tensor(means) * views
     return control
@@ -321,7 +321,7 @@ def grown_rows(model: TrainedModel, before: int) -> list[tuple[list[int], list[f
 
 
 def test_a_view_adds_its_gradients_sightings_and_opacities_to_the_right_primitives():
-    control = AdaptiveControl(Config(model=ModelConfig(coupled_primitives=K)), LONG, 3, CPU)
+    control = AdaptiveControl(Config(), LONG, (3, K), CPU)
     camera = Camera(np.eye(4), 50.0, 50.0, 24.0, 18.0, 48, 36)
     none = torch.zeros(3, 3)
     prediction = Prediction(
@@ -441,7 +441,7 @@ def test_candidates_know_which_new_cell_they_asked_for():
 def filled(config: ControlConfig) -> tuple[AdaptiveControl, TrainedModel]:
     """Two anchors that ask for nothing and stay: one often seen, with a primitive judged and one not; one seen once."""
     model = made_model([[0, 0, 0], [400, 0, 0]], [[0.0] * 3] * 2, config)
-    control = AdaptiveControl(model.config, LONG, 2, CPU)
+    control = AdaptiveControl(model.config, LONG, (2, K), CPU)
     control.gradient[:] = torch.tensor([[0.1, 0.2], [0.3, 0.4]])
     control.drawn[:] = torch.tensor([[10.0, 9.0], [1.0, 10.0]])
     control.opacity[:] = torch.tensor([20.0, 1.0])
@@ -476,7 +476,7 @@ def test_anchors_below_the_mean_opacity_go_if_they_were_in_view_often_enough(con
     n = 5
     references = [[float(i)] * 3 for i in range(n)]
     model = made_model([[100 * i, 0, 0] for i in range(n)], references, config)
-    control = AdaptiveControl(model.config, LONG, n, CPU)
+    control = AdaptiveControl(model.config, LONG, (n, K), CPU)
     control.seen[:] = torch.tensor([20.0, 10.0, 10.0, 0.0, 9.0])
     control.opacity[:] = control.seen * torch.tensor([6e-4, 6e-4, 4e-4, 0.0, 4e-4])
     act(control, model, torch.zeros(n, K, 3))

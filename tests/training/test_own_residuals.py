@@ -10,7 +10,7 @@ from compgs.codec import decode, encode
 from compgs.config import Config, load_config
 from compgs.scene.views import Scene
 from compgs.training.checkpoint import load_checkpoint
-from compgs.training.own_residuals import own_residuals
+from compgs.training.own_residuals import coupled_primitives, own_residuals
 from compgs.training.trainer import Trainer, train
 
 
@@ -48,6 +48,54 @@ def test_a_limit_of_zero_keeps_residuals_shared(training: dict[str, float], sett
     assert own_residuals(config, 2000, views)
     config = replace(config, model=replace(config.model, **{setting: 0.0}))
     assert not own_residuals(config, 2000, views)
+
+
+@pytest.mark.parametrize(
+    ("training", "views", "expected"),
+    [
+        ({"lmbda": 1e-4}, 22, 10),
+        ({"lmbda": 1e-4}, 23, 5),
+        ({"lmbda": 2e-4}, 12, 5),
+        ({"lmbda": 1.0, "target_bytes": 120_000}, 12, 10),
+        ({"lmbda": 0.0, "target_bytes": 119_999}, 12, 5),
+    ],
+)
+def test_anchors_have_twice_as_many_primitives_where_few_views_look_and_bits_are_cheaper_still(
+    training: dict[str, float], views: int, expected: int
+) -> None:
+    config = asked(**training)
+    assert coupled_primitives(config, 2000, views) == expected
+    assert (
+        coupled_primitives(
+            replace(config, model=replace(config.model, twice_coupled_where_few=0)), 2000, views
+        )
+        == 5
+    )
+    assert coupled_primitives(load_config("paper"), 2000, views) == 10, "as published"
+    assert coupled_primitives(
+        replace(config, model=replace(config.model, coupled_primitives=40)), 2000, views
+    ) == (64 if expected == 10 else 40), "as many as a file can hold"
+
+
+def test_a_run_with_twice_as_many_primitives_resumes_and_encodes_as_if_it_had_not_stopped(
+    blob_scene: Scene, tiny_config: Config, tmp_path: Path
+) -> None:
+    model = replace(tiny_config.model, residuals=False, twice_coupled_where_few=1e-4)
+    config = replace(tiny_config, model=model, training=replace(tiny_config.training, lmbda=1e-4))
+    device, twice = torch.device("cpu"), 2 * tiny_config.model.coupled_primitives
+    whole = Trainer(blob_scene, config, device)
+    assert whole.model.mask.shape[1] == twice
+    whole.run(None, None)
+    first = Trainer(blob_scene, config, device)
+    for _ in range(15):
+        first.train_step()
+    first.save(tmp_path / "checkpoint")
+    second = Trainer.resumed(blob_scene, tmp_path / "checkpoint", config, device)
+    second.run(None, None)
+    encode(whole.model, tmp_path / "whole.cgs")
+    encode(second.model, tmp_path / "resumed.cgs")
+    assert (tmp_path / "whole.cgs").read_bytes() == (tmp_path / "resumed.cgs").read_bytes()
+    assert decode(tmp_path / "whole.cgs").coupled > 0
 
 
 def test_a_run_with_few_views_trains_encodes_and_resumes_with_residuals_of_its_own(

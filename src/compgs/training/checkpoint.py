@@ -107,6 +107,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, writer: Writer | None = 
                 "viewpoints": [_camera_entry(camera) for camera in model.viewpoints],
                 "up": list(model.up),
                 "world_offset": list(model.world_offset),
+                "coupled_primitives": model.dimensions.coupled_primitives,
                 "width": model.dimensions.width,
                 "residuals": model.own_residuals,
                 "heads": model.dimensions.heads,
@@ -166,7 +167,9 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     if anchors == 0 or coordinates.abs().max() >= 1 << (COORDINATE_BITS - 1):
         raise ValueError(f"{anchors} anchors, expected some, at coordinates of {COORDINATE_BITS} bits")
     # Of as many anchors as there are coordinates, before as much memory is taken.
-    for name, columns in (("log_scales", 6), ("mask", config.model.coupled_primitives)):
+    few = config.model.coupled_primitives
+    k = whole_number(scene["coupled_primitives"], few, 2 * few, "coupled_primitives")
+    for name, columns in (("log_scales", 6), ("mask", k)):
         if tensors[name].shape != (anchors, columns):
             raise ValueError(f"{name}: expected {[anchors, columns]}, found {list(tensors[name].shape)}")
     if references.shape != (anchors, references.shape[-1]) or not (
@@ -184,7 +187,14 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     layout = scene["heads"]
     if layout not in ("separate", "paired"):
         raise ValueError(f"heads: expected separate or paired, found {layout!r}")
-    made = replace(config.model, reference_dim=references.shape[1], width=width, heads=layout, **flags)
+    made = replace(
+        config.model,
+        coupled_primitives=k,
+        reference_dim=references.shape[1],
+        width=width,
+        heads=layout,
+        **flags,
+    )
     model = TrainedModel(
         config,
         coordinates,

@@ -114,10 +114,16 @@ class Grows(AnchorRows, Protocol):
 class AdaptiveControl:
     """Statistics of the coupled primitives since they were last judged, and what follows from them."""
 
-    def __init__(self, config: Config, schedule: ControlSchedule, anchors: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        config: Config,
+        schedule: ControlSchedule,
+        shape: tuple[int, int],  # N, K
+        device: torch.device,
+    ) -> None:
         self.config = config
         self.schedule = schedule
-        k = config.model.coupled_primitives
+        anchors, k = shape
         self.gradient = torch.zeros(anchors, k, device=device)  # sum of 2D gradient norms, in half images
         self.drawn = torch.zeros(anchors, k, device=device)  # views in which the primitive was drawn
         self.opacity = torch.zeros(anchors, device=device)  # sum over views and slots

@@ -1,4 +1,5 @@
-"""Whether anchors have their own residual embeddings, where the settings leave it to training (not in the paper).
+"""Whether anchors have their own residual embeddings, and how many, where the settings leave it to training (not in the
+paper).
 
 Few views show a place from few sides, so that an anchor's primitives need to say less of how it looks from others, and
 more of what is there. Where views are many the same bits are better spent on more anchors, until bits are so cheap that
@@ -17,6 +18,9 @@ PASSES = (
 # Of a file for each anchor of the beginning, where a size is asked for: from here on bits are as cheap as with a lambda
 # of 1e-5 (docs/log/2026-11-23-16-top.md).
 CHEAP_BYTES = 40
+# From here on, where views are few, as with a lambda of 1e-4 (docs/log/2026-11-24-22-time.md).
+CHEAP_BYTES_WHERE_FEW = 60
+MOST_COUPLED = 64  # that a file can hold of an anchor
 
 
 @dataclass(frozen=True)
@@ -55,3 +59,15 @@ def long_run(config: Config, views: int) -> bool:
     """Whether there is the time to learn what many views show beyond what all anchors can share."""
     looked_at = config.training.steps * config.training.views_per_step
     return fewness(views) < FEW_ENOUGH and looked_at >= PASSES * views
+
+
+def coupled_primitives(config: Config, anchors: int, views: int) -> int:
+    """K of a run that starts with so many anchors: twice as many where few views look and bits are cheap."""
+    m, t = config.model, config.training
+    if fewness(views) < FEW_ENOUGH or m.twice_coupled_where_few == 0:
+        return m.coupled_primitives
+    if t.target_bytes is not None:
+        cheap = t.target_bytes >= CHEAP_BYTES_WHERE_FEW * anchors
+    else:
+        cheap = t.lmbda <= m.twice_coupled_where_few
+    return min(2 * m.coupled_primitives, MOST_COUPLED) if cheap else m.coupled_primitives

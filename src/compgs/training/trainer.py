@@ -149,7 +149,7 @@ class Trainer:
         self.optimizer = make_optimizer(self.model, t)
         self.schedule = make_schedule(config.control, t.steps, views, per_step)
         self.bounds = AnchorBounds(self.model, self.geometry)
-        self.control = AdaptiveControl(config, self.schedule, self.model.anchors, device)
+        self.control = AdaptiveControl(config, self.schedule, self.shape, device)
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
         self.noise = UniformNoise(t.seed + 3, self.views.chance, device)
         self.reference_rates: Tensor | None = None  # [reference_dim], once the channels differ in it

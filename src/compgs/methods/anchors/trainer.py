@@ -84,7 +84,8 @@ class AnchorTrainer:
         groups = [{"name": n, "params": p, "lr": r[0], "rates": r} for n, (p, r) in self.groups().items()]
         self.optimizer = torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
         self.schedule = make_schedule(config.control, t.steps, len(scene.train_views))
-        self.control = AdaptiveControl(control_settings(config), self.schedule, self.model.anchors, device)
+        shape = self.model.anchors, config.model.coupled_primitives
+        self.control = AdaptiveControl(control_settings(config), self.schedule, shape, device)
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
         self.settings = RasterSettings(background=scene.background)
         self.step = 0
