@@ -8,7 +8,7 @@ weights cost less than they save. Where anchors are many, or bits cheap, nothing
 from typing import Literal
 
 from compgs.config import Config
-from compgs.training.own_residuals import CHEAP_BYTES, long_run
+from compgs.training.own_residuals import CHEAP_BYTES, Limits, long_run
 
 # Hidden units from a price of a bit on, lambda / N as the run starts (docs/log/2026-11-23-14-pruning.md).
 WIDTHS = ((6e-7, 24), (1e-6, 16), (1.5e-6, 8))
@@ -52,9 +52,5 @@ def head_layout(config: Config, anchors: int, views: int) -> Literal["separate",
     """Of a run that starts with so many anchors: separate networks also where a long run has the time for them, and
     bits are so cheap that twice as many weights hardly count.
     """
-    m, t = config.model, config.training
-    cheap = t.lmbda <= m.separate_where_long
-    if t.target_bytes is not None:
-        cheap = t.target_bytes >= CHEAP_BYTES * anchors
-    wanted = m.separate_where_long > 0 and cheap and long_run(config, views)
-    return "separate" if wanted else m.heads
+    cheap = Limits(config.model.separate_where_long, CHEAP_BYTES).met(config, anchors)
+    return "separate" if cheap and long_run(config, views) else config.model.heads

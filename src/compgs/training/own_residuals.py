@@ -25,25 +25,26 @@ MOST_COUPLED = 64  # that a file can hold of an anchor
 
 @dataclass(frozen=True)
 class Limits:
-    """Up to which own residual embeddings are worth their bits."""
+    """Up to which what costs bits is worth them."""
 
-    lmbda: float
+    lmbda: float  # 0: never
     # For each anchor of the beginning, where a file's size is asked for: what files had with that lambda
     # (docs/log/2026-11-23-15-residuals.md).
     bytes: int
 
+    def met(self, config: Config, anchors: int) -> bool:
+        """Whether bits are as cheap in a run that starts with so many anchors."""
+        t = config.training
+        if self.lmbda == 0:
+            return False
+        if t.target_bytes is not None:
+            return t.target_bytes >= self.bytes * anchors
+        return t.lmbda <= self.lmbda
+
 
 def own_residuals(config: Config, anchors: int, views: int) -> bool:
     """Whether each anchor has its own in a run that starts with so many anchors."""
-    t = config.training
-    if config.model.residuals:
-        return True
-    limits = _limits(config, views)
-    if limits.lmbda == 0:
-        return False
-    if t.target_bytes is not None:
-        return t.target_bytes >= limits.bytes * anchors
-    return t.lmbda <= limits.lmbda
+    return config.model.residuals or _limits(config, views).met(config, anchors)
 
 
 def _limits(config: Config, views: int) -> Limits:
@@ -63,11 +64,7 @@ def long_run(config: Config, views: int) -> bool:
 
 def coupled_primitives(config: Config, anchors: int, views: int) -> int:
     """K of a run that starts with so many anchors: twice as many where few views look and bits are cheap."""
-    m, t = config.model, config.training
-    if fewness(views) < FEW_ENOUGH or m.twice_coupled_where_few == 0:
-        return m.coupled_primitives
-    if t.target_bytes is not None:
-        cheap = t.target_bytes >= CHEAP_BYTES_WHERE_FEW * anchors
-    else:
-        cheap = t.lmbda <= m.twice_coupled_where_few
-    return min(2 * m.coupled_primitives, MOST_COUPLED) if cheap else m.coupled_primitives
+    m = config.model
+    cheap = Limits(m.twice_coupled_where_few, CHEAP_BYTES_WHERE_FEW).met(config, anchors)
+    twice = cheap and fewness(views) >= FEW_ENOUGH
+    return min(2 * m.coupled_primitives, MOST_COUPLED) if twice else m.coupled_primitives
