@@ -89,18 +89,18 @@ def decode(path: Path) -> dict[str, Any]:
 
 def parts(path: Path) -> dict[str, Any]:
     """Sizes by section, and seconds of the parts of decoding."""
-    from compgs.codec.anchor_order import canonical_order
     from compgs.codec.content import (
         Role,
         conditional_tables,
-        coordinate_context,
         cross_entropy_bits,
         existing_symbols,
+        surroundings,
     )
     from compgs.codec.mask_coder import decode_masks, encode_masks
     from compgs.codec.octree import decode_positions, encode_positions
     from compgs.codec.rans import decode_symbols, encode_symbols
     from compgs.codec.reader import file_info, group_names, read_latents
+    from compgs.ordering.order import canonical_order
 
     data = path.read_bytes()
     content, latents = read_latents(data)
@@ -118,7 +118,7 @@ def parts(path: Path) -> dict[str, Any]:
     masks = best("encode masks", lambda: encode_masks(content.mask))
     best("decode masks", lambda: decode_masks(masks, *content.mask.shape))
     residual = content.group(Role.RESIDUAL)
-    places = best("contexts of coordinates", lambda: coordinate_context(content.coordinates))
+    places = best("contexts of coordinates", lambda: surroundings(content.coordinates).places)
     _, index, tables = best(
         "residual network",
         lambda: conditional_tables(residual.shape, residual.prior, latents, places, content.mask),
@@ -148,13 +148,13 @@ def beside_constriction(path: Path) -> dict[str, Any]:
     import numba
     import numpy as np
 
-    from compgs.codec.content import Role, conditional_tables, coordinate_context
+    from compgs.codec.content import Role, conditional_tables, surroundings
     from compgs.codec.rans import decode_symbols, encode_symbols
     from compgs.codec.reader import read_latents
     from compgs.codec.tables import gaussian_tables
 
     content, latents = read_latents(path.read_bytes())
-    group, places = content.group(Role.REFERENCE), coordinate_context(content.coordinates)
+    group, places = content.group(Role.REFERENCE), surroundings(content.coordinates).places
     _, index, _ = conditional_tables(group.shape, group.prior, latents, places, content.mask)
     index = np.ascontiguousarray(index.ravel()[:CONSTRICTION_SYMBOLS])
     symbols = np.ascontiguousarray(group.symbols.ravel()[:CONSTRICTION_SYMBOLS])

@@ -17,6 +17,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import starmap
 from pathlib import Path
 
 import numpy as np
@@ -126,18 +127,24 @@ def forged_groups(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
             groups[at] = replace(groups[at], channels=int(rng.choice([1, 2, 6, 64, 255, 256, 1 << 20])))
         case 5:
             context = tuple(j for j in range(len(groups)) if rng.random() < 0.4)
-            groups[at] = replace(groups[at], context=context, sees_coordinates=bool(rng.integers(2)))
+            groups[at] = replace(
+                groups[at],
+                context=context,
+                sees_coordinates=bool(rng.integers(2)),
+                sees_neighbours=bool(rng.integers(2)),
+            )
         case _:
             odd = [0.0, -1.0, 1.0, float("nan"), float("inf"), 1e-30]
             groups[at] = replace(groups[at], steps=tuple(rng.choice(odd, rng.integers(0, 8))))
     fields = struct.calcsize(SCENE_LAYOUT)
-    described = b"".join(_described(group) for group in groups)
+    described = b"".join(starmap(_described, enumerate(groups)))
     sections[i] = Section(SCENE, sections[i].data[:fields] + varint(len(groups)) + described)
     return pack(sections)
 
 
-def _described(shape: GroupShape) -> bytes:
-    context = SEES_COORDINATES * shape.sees_coordinates + sum(2 << i for i in shape.context)
+def _described(index: int, shape: GroupShape) -> bytes:
+    taken = (*shape.context, index) if shape.sees_neighbours else shape.context
+    context = SEES_COORDINATES * shape.sees_coordinates + sum(2 << i for i in taken)
     steps = struct.pack(f"<{len(shape.steps)}f", *shape.steps)
     return bytes([shape.role]) + varint(shape.channels) + varint(context) + varint(len(shape.steps)) + steps
 
@@ -174,7 +181,7 @@ def forged_network(rng: np.random.Generator, data: bytes, other: bytes) -> bytes
     i = next(i for i, section in enumerate(sections) if section.number == NETWORKS)
     reader = FieldReader(sections[i].data, "entropy networks")
     places = []
-    for _ in scene.dimensions.network_sizes:
+    for follows in scene.dimensions.networks_that_follow:
         places.append(reader.position)
         layers = reader.varint("layers", 1, 8)
         places.append(reader.position)
@@ -184,6 +191,9 @@ def forged_network(rng: np.random.Generator, data: bytes, other: bytes) -> bytes
             reader.varint("width", 1, 1 << 16)
             places.append(reader.position)
             reader.bytes(1, "flags")
+        if follows:
+            places.append(reader.position)
+            reader.bytes(1, "follow shift")
     payload = bytearray(sections[i].data)
     for _ in range(rng.integers(1, 4)):
         place = int(rng.choice(places))

@@ -21,10 +21,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from compgs.codec.anchor_order import canonical_order, sorted_morton
 from compgs.codec.mask_coder import decode_masks, encode_masks
 from compgs.codec.octree import decode_positions, encode_positions
 from compgs.codec.tmc3 import PROGRAM, decode_positions_tmc3, encode_positions_tmc3
+from compgs.ordering.order import canonical_order, sorted_morton
 
 T = TypeVar("T")
 

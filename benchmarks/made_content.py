@@ -1,5 +1,6 @@
 """Made-up but plausible file contents: for the codec's tests, golden files and benchmark."""
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -12,13 +13,13 @@ from compgs.codec.content import (
     Group,
     GroupShape,
     Role,
-    conditional_tables,
-    coordinate_context,
+    code_group,
     fixed_point,
-    reconstruct,
+    surroundings,
 )
-from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork
+from compgs.codec.integer_network import FRACTION_BITS, Follow, IntegerLayer, IntegerNetwork
 from compgs.codec.tables import hyper_tables
+from compgs.ordering.order import canonical_order
 
 WEIGHT_SHIFT = 10
 RANDOM_ROWS = 16384
@@ -66,19 +67,31 @@ def make_content(
     d = dimensions or make_dimensions()
     rng = np.random.default_rng(seed)
     coordinates = make_coordinates(anchors, rng)
+    if any(shape.sees_neighbours for shape in d.groups):
+        coordinates = coordinates[canonical_order(coordinates)]
     mask = rng.random((anchors, d.coupled_primitives)) < kept
     # Symbols of all slots are drawn; a mask of ones here keeps the draw apart from the mask.
     everything = np.ones_like(mask)
-    places = coordinate_context(coordinates)
+    known = surroundings(coordinates)
     latents: list[np.ndarray] = []
     groups = []
     for shape in d.groups:
         rows = anchors * (d.coupled_primitives if shape.role == Role.RESIDUAL else 1)
         if shape.has_network:
             prior: IntegerNetwork | tuple = _network(rng, *d.network_size(shape), blocks, hidden, symbols)
-            means, index, _ = conditional_tables(shape, prior, latents, places, everything)
-            drawn = _draw(rng, index, symbols)
-            latents.append(reconstruct(drawn, means))
+            if shape.sees_neighbours:
+                follow = rng.integers(-600, 900, shape.channels).astype(np.int32)
+                prior = replace(prior, follow=Follow(follow, WEIGHT_SHIFT))
+            coded = code_group(
+                shape,
+                prior,
+                latents,
+                known,
+                everything,
+                lambda rows, means, index: _draw(rng, index, symbols),
+            )
+            drawn = coded.symbols
+            latents.append(coded.latents)
         else:
             spread = np.linspace(0.5, 6.0, shape.channels)
             drawn = np.rint(rng.standard_normal((rows, shape.channels)) * spread * symbols).astype(np.int32)

@@ -100,7 +100,11 @@ def cgs_bytes() -> bytes:
     """A file of about a hundred anchors with plausible latents, in a cube of two units around the origin."""
     torch.manual_seed(0)
     coordinates = np.unique(np.random.default_rng(0).integers(-20, 20, (100, 3)), axis=0).astype(np.int32)
-    config = Config(model=ModelConfig(coupled_primitives=4, reference_dim=8, residuals=True, width=16))
+    config = Config(
+        model=ModelConfig(
+            coupled_primitives=4, reference_dim=8, residuals=True, width=16, reference_context="hyperprior"
+        )
+    )
     model = TrainedModel(config, torch.from_numpy(coordinates), 0.05, 3.0, (0.1, 0.2, 0.3))
     with torch.no_grad():
         model.references.normal_(0, 4)

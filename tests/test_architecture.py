@@ -47,22 +47,23 @@ ALLOWED = {
     "numerics": {"compgs", "extras"},  # `compgs.started`
     "scene": BASE,
     "render": BASE,
+    "ordering": BASE,
     "model": BASE,
     "tensors": BASE | {"model", "render"},
-    "entropy": BASE | {"tensors"},
+    "entropy": BASE | {"tensors", "ordering"},
     "losses": BASE | {"tensors"},
     "metrics": BASE,
     "stored_weights": BASE | {"model", "entropy"},
     "trained_model": BASE | {"model", "entropy", "tensors", "devices", "stored_weights"},
-    "codec": BASE | {"model", "devices", "entropy", "trained_model"},
+    "codec": BASE | {"model", "devices", "entropy", "trained_model", "ordering"},
     "formats": BASE
     | {"model", "render", "devices", "codec", "methods"},  # up for a method's own files, which name it
     "training": BASE
     | {"scene", "render", "model", "tensors", "devices", "entropy", "losses", "metrics", "trained_model"}
-    | {"codec"},  # what positions and masks take, for a size that is asked for
+    | {"codec", "ordering"},  # what positions and masks take, for a size that is asked for
     "methods": BASE
     | {"scene", "model", "entropy", "render", "tensors", "devices", "losses", "metrics", "codec", "formats"}
-    | {"training", "trained_model", "stored_weights"},
+    | {"training", "trained_model", "stored_weights", "ordering"},
     "reconstruct": BASE | {"scene"},
     "evaluation": BASE | {"scene", "render", "model", "devices", "metrics", "codec", "formats"},
     "viewer": BASE | {"render", "model", "devices", "metrics", "codec", "formats", "evaluation"},

@@ -104,6 +104,7 @@ def group(c: Cursor, index: int) -> Iterator[Row]:
     yield role + raw, f"group {index}: `role` {role[0]}, {kind}; `channels` {channels}"
     raw, context = c.varint()
     seen = ["coordinates"] * (context & 1) + [f"group {i}" for i in range(index) if context >> (i + 1) & 1]
+    seen += ["neighbours"] * (context >> (index + 1) & 1)
     yield raw, f"group {index}: `context` {context}: {' and '.join(seen) or 'none, so tables'}"
     raw, count = c.varint()
     steps = c.take(4 * count)
@@ -149,9 +150,10 @@ def tables(c: Cursor, count: int) -> Iterator[Row]:
         yield from arrays(c, 1)
 
 
-def networks(c: Cursor, names: list[str]) -> Iterator[Row]:
+def networks(c: Cursor, names: list[str], follow: list[bool]) -> Iterator[Row]:
+    """follow: whether the means of each follow neighbours."""
     total = 0
-    for name in names:
+    for name, follows in zip(names, follow, strict=True):
         raw, layers = c.varint()
         flags = c.take(1)
         skip = ", skip" * flags[0]
@@ -162,6 +164,10 @@ def networks(c: Cursor, names: list[str]) -> Iterator[Row]:
             flags = c.take(1)
             marks = ", rectify" * bool(flags[0] & RECTIFY) + ", adds" * bool(flags[0] & ADDS)
             yield raw + flags, f"layer {i}: {outputs} outputs, shift {flags[0] & SHIFTS}{marks}"
+        if follows:
+            total += 1
+            raw = c.take(1)
+            yield raw, f"`follow_shift` {raw[0]}"
     if total:
         yield from arrays(c, total)
 
@@ -228,7 +234,7 @@ def rows(data: bytes) -> Iterator[Row]:
         POSITIONS: payload,
         MASKS: payload,
         TABLES: lambda c: tables(c, d.table_count),
-        NETWORKS: lambda c: networks(c, names),
+        NETWORKS: lambda c: networks(c, names, d.networks_that_follow),
         HEADS: heads,
         LATENTS: lambda c: latents(c, content),
         METADATA: metadata,
@@ -268,6 +274,10 @@ def values(data: bytes) -> str:
             continue
         for n, layer in enumerate(part.prior.layers):
             lines.append(f"| group {i}, layer {n} | W {layer.weight.tolist()}, b {layer.bias.tolist()} |")
+        if part.prior.follow:
+            lines.append(
+                f"| group {i}, follow, times 2^{part.prior.follow.shift} | {part.prior.follow.weight.tolist()} |"
+            )
     for name, tensor in content.heads:
         lines.append(f"| {name}, times 2^{tensor.exponent} | {tensor.values.tolist()} |")
     return "\n".join(lines)

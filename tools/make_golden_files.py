@@ -2,7 +2,8 @@
 
     python tools/make_golden_files.py
 
-Run it when the version of the format rises, and only then: golden files of a version decode for ever.
+Run it when the version of the format rises, and only then: golden files of a version decode for ever. (All but
+`neighbours` are of version 2: nothing in them needs a later one.)
 """
 
 import hashlib
@@ -47,6 +48,14 @@ CONSTANT_GROUPS = (
     GroupShape(Role.LOG_SCALES, 6, DEFAULT_STEPS, (0,)),
 )
 
+# What neighbours have as context: alone, as the default preset has it, and beside all else.
+NEIGHBOUR_GROUPS = (
+    GroupShape(Role.SIDE, 2, sees_neighbours=True),
+    GroupShape(Role.REFERENCE, 8, (0.33,), sees_neighbours=True),
+    GroupShape(Role.REFERENCE, 3, (0.5,), (0, 1), sees_coordinates=True, sees_neighbours=True),
+    GroupShape(Role.LOG_SCALES, 6, DEFAULT_STEPS, (1,)),
+)
+
 VIEWPOINTS = Viewpoints(
     up=(0.0, -0.6, 0.8),
     views=(
@@ -64,7 +73,7 @@ TRAINED = ("trained",)
 
 def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
     """Content and levels of the ranges, by name: the smallest sensible file, one as the default preset makes it, one as
-    it makes small ones, one as the paper's preset does, one with everything unusual.
+    it makes small ones, one as the paper's preset does, one with neighbours, one with everything unusual.
     """
     tiny = make_content(3, 1, make_dimensions(2, paper_groups(2, 0, 1), width=2, residual_dim=2), kept=0.7)
     default = make_content(800, 2, make_dimensions(5, paper_groups(12, 0)))
@@ -75,7 +84,14 @@ def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
     for layer in constant.groups[0].prior.layers:
         layer.weight[:] = 0
     paper = make_content(60, 4, make_dimensions(10, paper_groups(16, 4)), blocks=2, hidden=12)
-    made = {"tiny": tiny, "default": default, "constant": constant, "paper": paper}
+    neighbours = make_content(500, 6, make_dimensions(5, NEIGHBOUR_GROUPS))
+    made = {
+        "tiny": tiny,
+        "default": default,
+        "constant": constant,
+        "paper": paper,
+        "neighbours": neighbours,
+    }
     return {**{name: (content, None) for name, content in made.items()}, "odd": odd()}
 
 

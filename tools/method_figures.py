@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 
 from compgs.cameras import Camera
 from compgs.codec import decode
-from compgs.codec.content import FileContent, Role, coordinate_context, walk
+from compgs.codec.content import FileContent, Role, surroundings, walk
 from compgs.codec.reader import file_info, read_content
 from compgs.gaussians import Gaussians
 from compgs.metrics import psnr, to_8bit
@@ -95,7 +95,7 @@ def bits_of_anchors(content: FileContent) -> np.ndarray:
     owner = np.repeat(np.arange(len(content.mask)), content.mask.sum(1))
     for group, coded in zip(
         content.groups,
-        walk(content.groups, content.mask, coordinate_context(content.coordinates)),
+        walk(content.groups, content.mask, surroundings(content.coordinates, content.levels)),
         strict=True,
     ):
         t = coded.tables
@@ -157,7 +157,7 @@ def symbols(content: FileContent) -> bytes:
     coded = dict(
         zip(
             [group.shape.role for group in content.groups],
-            walk(content.groups, content.mask, coordinate_context(content.coordinates)),
+            walk(content.groups, content.mask, surroundings(content.coordinates, content.levels)),
             strict=True,
         )
     )[Role.REFERENCE]

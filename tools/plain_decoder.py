@@ -20,7 +20,8 @@ from typing import Any
 GAUSSIAN_TABLES = Path(__file__).parent.parent / "src" / "compgs" / "codec" / "gaussian_tables.bin"
 
 MAGIC = b"\x93CGS"
-VERSION = 2
+VERSION = 3
+OLDEST_VERSION = 2
 OPTIONAL = 0x80
 MAX_SECTIONS = 64
 MAX_ANCHORS = 2**24
@@ -56,6 +57,8 @@ MAX_RANK = 4
 MAX_EXPONENT = 62
 MAX_WEIGHTS = 2**22
 MAX_LOW_BITS = 26
+FOLLOW_LIMIT = 2**28
+NEAREST_WEIGHT = 2**24
 
 SCENE, POSITIONS, GPCC, MASKS, TABLES, NETWORKS, HEADS, LATENTS = range(1, 9)
 METADATA, PADDING, VIEWPOINTS = 129, 130, 131
@@ -164,6 +167,7 @@ class Fields:
 
 @dataclass(frozen=True)
 class Group:
+    index: int  # among the groups
     role: int
     channels: int
     context: int
@@ -176,7 +180,11 @@ class Group:
         return self.slots(k) * self.channels
 
     def contexts(self) -> list[int]:
-        return [j for j in range(MAX_GROUPS) if self.context >> (j + 1) & 1]
+        """The groups whose latents its network takes."""
+        return [j for j in range(self.index) if self.context >> (j + 1) & 1]
+
+    def takes_neighbours(self) -> bool:
+        return self.context >> (self.index + 1) & 1 == 1
 
 
 @dataclass(frozen=True)
@@ -196,10 +204,11 @@ class Scene:
     def network_size(self, group: Group) -> tuple[int, int]:
         """Inputs and outputs."""
         inputs = 3 * (group.context & 1) + sum(self.groups[j].channels for j in group.contexts())
+        inputs += 2 * group.takes_neighbours()
         return inputs, 2 * group.width(self.coupled_primitives)
 
 
-def read_scene(data: bytes) -> Scene:
+def read_scene(data: bytes, version: int) -> Scene:
     fields = Fields(data, NAMES[SCENE])
     anchors = fields.number("I", 1, MAX_ANCHORS, "anchors")
     (coupled,) = fields.unpack("I")
@@ -214,7 +223,7 @@ def read_scene(data: bytes) -> Scene:
     background = tuple(fields.number("f", -LARGEST, LARGEST, "background") for _ in range(3))
     groups: list[Group] = []
     for _ in range(fields.number("B", 1, MAX_GROUPS, "groups")):
-        groups.append(read_group(fields, groups, k))
+        groups.append(read_group(fields, version, groups, k))
     fields.end()
     channels = [sum(group.channels for group in groups if group.role == role) for role in range(4)]
     fields.require(1 <= channels[REFERENCE] <= MAX_REFERENCE_DIM, f"reference_dim is {channels[REFERENCE]}")
@@ -224,15 +233,17 @@ def read_scene(data: bytes) -> Scene:
     return Scene(*numbers, world_offset, view_distance_scale, background, tuple(groups))
 
 
-def read_group(fields: Fields, before: list[Group], k: int) -> Group:
+def read_group(fields: Fields, version: int, before: list[Group], k: int) -> Group:
     role = fields.varint(0, 3, "role")
     channels = fields.varint(1, MOST_CHANNELS[role], "channels")
-    context = fields.varint(0, 2 ** (len(before) + 1) - 1, "context")
+    bits = len(before) + (1 if version == 2 else 2)
+    context = fields.varint(0, 2**bits - 1, "context")
     count = fields.varint(0, channels, "steps")
     fields.require(count in ((0,) if role == SIDE else (1, channels)), f"{count} steps")
     steps = [fields.number("f", SMALLEST, LARGEST, "step") for _ in range(count)]
-    group = Group(role, channels, context, steps)
+    group = Group(len(before), role, channels, context, steps)
     fields.require(all(before[j].role != RESIDUAL for j in group.contexts()), "residuals as context")
+    fields.require(role != RESIDUAL or not group.takes_neighbours(), "neighbours of residuals")
     fields.require(context > 0 or group.width(k) <= MAX_TABLES, f"a group of {group.width(k)} tables")
     return group
 
@@ -389,6 +400,8 @@ class Layer:
 class Network:
     layers: list[Layer]
     skip: bool
+    follow_shift: int
+    follow: list[int]  # of each channel; empty unless the group takes neighbours
     weights: list[list[list[int]]]  # of each layer [outputs][inputs]
     biases: list[list[int]]
 
@@ -398,30 +411,37 @@ def read_networks(
 ) -> dict[int, Network]:
     """By group. n: the length of the file, which pays for the products with the anchors."""
     fields = Fields(data, NAMES[NETWORKS])
-    shapes = {i: read_layers(fields, *scene.network_size(g)) for i, g in enumerate(scene.groups) if g.context}
+    shapes = {i: read_layers(fields, scene, g) for i, g in enumerate(scene.groups) if g.context}
     if not shapes:
         fields.end()
         return {}
-    layers = [layer for layers, _ in shapes.values() for layer in layers]
+    layers = [layer for own, _, _ in shapes.values() for layer in own]
     weights = sum(layer.inputs * layer.outputs for layer in layers)
     allowed = FREE_NETWORK_PRODUCTS + NETWORK_PRODUCTS_PER_BYTE * n
     fields.require(anchors * weights <= allowed, f"{anchors * weights} products, expected up to {allowed}")
-    elements = weights + sum(layer.outputs for layer in layers)
-    fields.require(elements <= MAX_WEIGHTS, f"{elements} elements, expected up to {MAX_WEIGHTS}")
     sizes = []
-    for layer in layers:
-        upper = (layer.outputs + 1) // 2
-        lower = layer.outputs - upper
-        sizes += [upper * layer.inputs, lower * layer.inputs, upper, lower]
+    for i, (own, _, _) in shapes.items():
+        for layer in own:
+            upper = (layer.outputs + 1) // 2
+            lower = layer.outputs - upper
+            sizes += [upper * layer.inputs, lower * layer.inputs, upper, lower]
+        if scene.groups[i].takes_neighbours():
+            sizes.append(scene.groups[i].channels)
+    fields.require(sum(sizes) <= MAX_WEIGHTS, f"{sum(sizes)} elements, expected up to {MAX_WEIGHTS}")
     arrays = iter(integer_arrays(fields, sizes, gaussian))
     networks = {}
-    for i, (layers, skip) in shapes.items():
-        parameters = [read_parameters(fields, layer, arrays) for layer in layers]
-        networks[i] = Network(layers, skip, [w for w, _ in parameters], [b for _, b in parameters])
+    for i, (own, skip, shift) in shapes.items():
+        parameters = [read_parameters(fields, layer, arrays) for layer in own]
+        follow = next(arrays) if scene.groups[i].takes_neighbours() else []
+        fields.require(all(abs(v) < FOLLOW_LIMIT for v in follow), "an element of follow")
+        weights, biases = map(list, zip(*parameters, strict=True))
+        networks[i] = Network(own, skip, shift, follow, weights, biases)
     return networks
 
 
-def read_layers(fields: Fields, inputs: int, outputs: int) -> tuple[list[Layer], bool]:
+def read_layers(fields: Fields, scene: Scene, group: Group) -> tuple[list[Layer], bool, int]:
+    """Layers, skip and follow_shift of a network."""
+    inputs, outputs = scene.network_size(group)
     count = fields.varint(1, MAX_LAYERS, "layers")
     skip = fields.number("B", 0, int(count > 1), "flags of a network") == 1
     layers: list[Layer] = []
@@ -437,7 +457,8 @@ def read_layers(fields: Fields, inputs: int, outputs: int) -> tuple[list[Layer],
             fields.require(width == layers[-1].inputs, f"{width} outputs are added to {layers[-1].inputs}")
         fields.require(not last or width == outputs, f"the last layer has {width} outputs, not {outputs}")
         layers.append(layer)
-    return layers, skip
+    follow_shift = fields.number("B", 0, MAX_SHIFT, "follow_shift") if group.takes_neighbours() else 0
+    return layers, skip, follow_shift
 
 
 def read_parameters(
@@ -907,18 +928,27 @@ class Decoded:
 
 
 def read_group_symbols(
-    fields: Fields, model: Model, i: int, existing: list[list[int]], inputs: list[list[int]]
+    fields: Fields,
+    model: Model,
+    i: int,
+    existing: list[list[int]],
+    inputs: list[list[int]],
+    around: list[list[int]],
 ) -> Decoded:
-    """existing: of each anchor, the slots that have symbols. inputs: of each anchor, what the network takes."""
+    """existing: of each anchor, the slots that have symbols. inputs: of each anchor, what the network takes. around:
+    of each anchor, what its means follow; nothing unless the group takes neighbours.
+    """
     group = model.scene.groups[i]
     means: list[int] = []
     tables: list[Table] = []
-    for slots, x in zip(existing, inputs, strict=True):
+    for slots, x, near in zip(existing, inputs, around, strict=True):
         channels = [slot * group.channels + c for slot in slots for c in range(group.channels)]
         if i in model.networks:
             y = evaluate(model.networks[i], x)
-            scales = y[len(y) // 2 :]
-            means += [y[c] for c in channels]
+            mean, scales = y[: len(y) // 2], y[len(y) // 2 :]
+            if group.takes_neighbours():
+                mean = followed(model.networks[i], mean, near)
+            means += [mean[c] for c in channels]
             tables += [model.gaussian[clamp((scales[c] + 2048) >> 12, 0, 127)] for c in channels]
         else:
             means += [0] * len(channels)
@@ -929,8 +959,66 @@ def read_group_symbols(
     return Decoded(rows(symbols, group.channels), rows(latents, group.channels))
 
 
-def read_range(fields: Fields, model: Model, places: list[list[int]], mask: list[list[int]]) -> list[Decoded]:
-    """places: coordinates of the range's anchors as networks take them; mask: of the same anchors."""
+@dataclass(frozen=True)
+class Earlier:
+    """The anchors of the ranges before one."""
+
+    shift: int  # from an offset to its node
+    offsets: list[Cell]
+    ranges: list[list[Decoded]]
+
+    def node(self, offset: Cell) -> Cell:
+        return (offset[0] >> self.shift, offset[1] >> self.shift, offset[2] >> self.shift)
+
+
+def followed(network: Network, outputs: list[int], around: list[int]) -> list[int]:
+    """An anchor's means."""
+    s = network.follow_shift
+    half = 2 ** (s - 1) if s > 0 else 0
+    means = []
+    for output, b, f, v in zip(outputs, network.biases[-1], network.follow, around, strict=False):
+        moved = output - b + ((f * v + half) >> s)
+        means.append(activation(b + (((moved + 2048) >> 12) << 12)))
+    return means
+
+
+def neighbours_have(
+    earlier: Earlier | None, offsets: list[Cell], group: Group, means: list[int]
+) -> list[list[int]]:
+    """Of each anchor of a range: known, activity, and around of each channel. means: of the channels."""
+    if earlier is None:
+        return [[0] * (2 + group.channels) for _ in offsets]
+    latents = [row for decoded in earlier.ranges for row in decoded[group.index].latents]
+    d = [[activation(x - b) for x, b in zip(row, means, strict=True)] for row in latents]
+    a = [sum(map(abs, row)) // group.channels for row in d]
+    at_node = {earlier.node(offset): j for j, offset in enumerate(earlier.offsets)}
+    have = []
+    for offset in offsets:
+        nodes = [moved(earlier.node(offset), step) for step in [(0, 0, 0), *AROUND]]
+        near = [at_node[node] for node in nodes if node in at_node]
+        w = [1 + NEAREST_WEIGHT // distance(offset, earlier.offsets[j]) for j in near]
+        columns = zip(*([a[j], *d[j]] for j in near), strict=True)
+        average = [sum(v * x for v, x in zip(w, column, strict=True)) // sum(w) for column in columns]
+        have.append([4096, *average])
+    return have
+
+
+def distance(a: Cell, b: Cell) -> int:
+    return sum(abs(p - q) for p, q in zip(a, b, strict=True))
+
+
+def read_range(
+    fields: Fields,
+    model: Model,
+    positions: Positions,
+    begin: int,
+    mask: list[list[int]],
+    earlier: Earlier | None,
+) -> list[Decoded]:
+    """begin: the range's first anchor; mask: of its anchors; earlier: None for the first range."""
+    anchors = range(begin, begin + len(mask))
+    places = [positions.context(i) for i in anchors]
+    offsets = [positions.offsets[i] for i in anchors]
     decoded: list[Decoded] = []
     for i, group in enumerate(model.scene.groups):
         existing = [
@@ -938,8 +1026,14 @@ def read_range(fields: Fields, model: Model, places: list[list[int]], mask: list
         ]
         sources = [places] if group.context & 1 else []
         sources += [decoded[j].latents for j in group.contexts()]
+        around: list[list[int]] = [[] for _ in mask]
+        if group.takes_neighbours():
+            means = model.networks[i].biases[-1][: group.channels]
+            have = neighbours_have(earlier, offsets, group, means)
+            sources.append([row[:2] for row in have])
+            around = [row[2:] for row in have]
         inputs = [[v for source in sources for v in source[a]] for a in range(len(mask))]
-        decoded.append(read_group_symbols(fields, model, i, existing, inputs))
+        decoded.append(read_group_symbols(fields, model, i, existing, inputs, around))
     fields.end()
     return decoded
 
@@ -1008,6 +1102,7 @@ def read_metadata(data: bytes) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class File:
+    version: int
     sections: dict[int, bytes]  # but for the latents
     latents: list[bytes]  # those that are there
     whole: bool  # all of them are
@@ -1019,8 +1114,8 @@ def check_head(data: bytes) -> list[tuple[int, int, int]]:
         raise NotACompGSFile("the first bytes are not those of a .cgs file")
     if len(data) < 7:
         raise TruncatedSection(f"the header ends after {len(data)} bytes")
-    if data[4] != VERSION:
-        raise UnsupportedVersion(f"version {data[4]}, expected {VERSION}")
+    if not OLDEST_VERSION <= data[4] <= VERSION:
+        raise UnsupportedVersion(f"version {data[4]}, expected {OLDEST_VERSION} to {VERSION}")
     count = data[6]
     end = 7 + 9 * count
     if len(data) < end + 4:
@@ -1068,7 +1163,8 @@ def read_file(data: bytes, prefix: bool) -> File:
         at += length
     else:
         require(at == len(data), "file", f"{len(data) - at} bytes after the last section")
-    return File(sections, latents, len(latents) == sum(number == LATENTS for number, _, _ in table))
+    whole = len(latents) == sum(number == LATENTS for number, _, _ in table)
+    return File(data[4], sections, latents, whole)
 
 
 def decode(data: bytes, prefix: bool = False) -> dict[str, Any]:
@@ -1081,7 +1177,7 @@ def decode(data: bytes, prefix: bool = False) -> dict[str, Any]:
     """
     file = read_file(data, prefix)
     sections = file.sections
-    scene = read_scene(sections[SCENE])
+    scene = read_scene(sections[SCENE], file.version)
     ranges = [Fields(payload, NAMES[LATENTS]) for payload in file.latents]
     heads = read_range_heads(ranges)
     anchors = sum(head.anchors for head in heads) if prefix else scene.anchors
@@ -1096,12 +1192,13 @@ def decode(data: bytes, prefix: bool = False) -> dict[str, Any]:
     found = sum(map(sum, mask))
     require(found == scene.coupled, "masks", f"{found} coupled primitives, expected {scene.coupled}")
     check_ranges(heads, file.whole, positions, mask)
-    decoded = []
+    decoded: list[list[Decoded]] = []
+    earlier = None
     begin = 0
     for fields, head in zip(ranges, heads, strict=True):
         end = begin + head.anchors
-        places = [positions.context(i) for i in range(begin, end)]
-        decoded.append(read_range(fields, model, places, mask[begin:end]))
+        decoded.append(read_range(fields, model, positions, begin, mask[begin:end], earlier))
+        earlier = Earlier(positions.depth - head.level, positions.offsets[:end], decoded)
         begin = end
     require(not any(sections.get(PADDING, b"")), "padding", "a byte is not zero")
     numbers = asdict(scene)

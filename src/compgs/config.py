@@ -75,15 +75,17 @@ class ModelConfig:
     residuals_where_many: Annotated[float, Range(0, 100)] = 1e-5
     # hidden width of the residual MLPs (Ref.)
     width: Annotated[int, Range(8, 256, multiple=8)] = 32
-    # reference embeddings have a hyperprior (Sec. 3.3); else each of their channels is coded around one mean
-    hyperprior: bool = True
-    # networks are narrower, their weights of fewer bits, than `width` and `head_bits` say, and there is no hyperprior,
-    # where networks would be a sixth of the file and more: a large lambda and few anchors, or a small file that is
-    # asked for (not in the paper)
+    # what reference embeddings are coded around: what anchors around them have that come before in the file (not in
+    # the paper; training pays by a hyperprior, which the file does not hold), a hyperprior (Sec. 3.3), or one mean a
+    # channel
+    reference_context: Literal["neighbours", "hyperprior", "none"] = "neighbours"
+    # networks are narrower, their weights of fewer bits, than `width` and `head_bits` say, and there is no such
+    # context, where networks would be a sixth of the file and more: a large lambda and few anchors, or a small file
+    # that is asked for (not in the paper)
     networks_by_price: bool = True
     # separate: four networks (Sec. 3.2); paired: geometry, appearance
     heads: Literal["separate", "paired"] = "paired"
-    # lambda up to which networks are separate in spite of it, in runs that pass over many views 45 times and more;
+    # lambda up to which networks are separate in spite of it, in runs that pass over the views 45 times and more;
     # 0: never (not in the paper)
     separate_where_long: Annotated[float, Range(0, 100)] = 1e-5
     # world units between neighbouring anchors; None: from the points' spacing

@@ -15,6 +15,7 @@ from compgs.cameras import Camera
 from compgs.config import Config, ModelConfig
 from compgs.devices import placed
 from compgs.entropy.models import Quantized, make_entropy_model
+from compgs.entropy.neighbourhood import Neighbourhood, neighbourhood
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.head_weights import HeadDimensions
 from compgs.model.hybrid_model import HybridModel
@@ -123,6 +124,7 @@ class TrainedModel(nn.Module):
         self.head_bits = config.entropy.head_bits
         self.heads = make_heads(m.heads, HeadDimensions(m.reference_dim, m.residual_dim, m.width))
         self.entropy = make_entropy_model(m, config.entropy)
+        self._neighbourhood: tuple[Tensor, Neighbourhood] | None = None  # of the coordinates as they were
         self.register_buffer("coordinates", coordinates.to(torch.int32))
         self.register_buffer("mask", torch.ones(n, m.coupled_primitives, dtype=torch.bool))
         self.log_scales = nn.Parameter(torch.zeros(n, 6))
@@ -240,10 +242,27 @@ class TrainedModel(nn.Module):
             noise=noise,
             network_bits=stored.network if stored else None,
             mask=mask,
+            around=self.around(rows, decoded=noise is None) if rate else None,
         )
         if e.quantized:
             return latents
-        return Quantized(references, covariances, residuals.expand(len(references), -1), latents.bits)
+        residuals = residuals.expand(len(references), -1)
+        return Quantized(references, covariances, residuals, latents.bits, latents.neighbour_bits)
+
+    @torch.no_grad()
+    def around(self, rows: Tensor | None = None, *, decoded: bool = True) -> Tensor | None:
+        """[V, 2 + reference_dim] what neighbours of the anchors in `rows` [V] int64 (None: of all) have as `decoded`,
+        or before it is rounded; None if the references do not see them.
+        """
+        if self.entropy.context_of_references != "neighbours":
+            return None
+        found = self._neighbourhood
+        if found is None or found[0] is not self.coordinates:
+            found = self._neighbourhood = (self.coordinates, neighbourhood(self.coordinates))
+        assert self.entropy.neighbour_network is not None
+        centre = self.entropy.neighbour_network.centre
+        references = (self.references - centre).round() + centre if decoded else self.references
+        return found[1].around(references, centre, rows)
 
     def primitives(self, latents: Quantized, rows: Tensor | None = None) -> Primitives:
         """Dequantize: all K coupled primitives of the given anchors, as prediction sees them."""
@@ -288,13 +307,15 @@ class TrainedModel(nn.Module):
         return placed(model, self.device)
 
     @torch.no_grad()
-    def bits_of_anchors(self, mask: Tensor | None = None) -> dict[str, Tensor]:
+    def bits_of_anchors(self, mask: Tensor | None = None, *, in_file: bool = True) -> dict[str, Tensor]:
         """Bits [n] of each stream of the file for the anchors that have one of the coupled primitives of `mask` [N, K]
         bool (default: of those that exist), by the model's own probabilities; weights and positions not included.
+        Not `in_file`: as training pays for them.
         """
         mask = self.mask if mask is None else mask
         coded = torch.nonzero(mask.any(1)).view(-1)
-        return self.quantized(coded, rate=True, mask=mask.index_select(0, coded)).bits
+        latents = self.quantized(coded, rate=True, mask=mask.index_select(0, coded))
+        return latents.bits_in_file if in_file else latents.bits
 
     def estimated_bits(self, mask: Tensor | None = None) -> dict[str, float]:
         """Sums of `bits_of_anchors`."""

@@ -11,16 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compgs.codec import integer_network
-from compgs.codec.anchor_order import canonical_order
 from compgs.codec.content import (
     Dimensions,
     FileContent,
     Group,
     GroupShape,
     Role,
-    coordinate_context,
     cross_entropy_bits,
     dequantize,
+    surroundings,
 )
 from compgs.codec.format import MASKS, MAX_SYMBOL, pack, unpack
 from compgs.codec.integer_network import IntegerLayer, IntegerNetwork
@@ -28,6 +27,7 @@ from compgs.codec.reader import file_info, group_names, read_content, read_laten
 from compgs.codec.tables import HyperTable
 from compgs.codec.writer import write_content
 from compgs.errors import CorruptSection, NotEncodable
+from compgs.ordering.order import canonical_order, level_counts
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from made_content import make_content, make_dimensions, paper_groups
@@ -74,7 +74,7 @@ def assert_same(a: FileContent, b: FileContent) -> None:
         (n, t.exponent, t.values.tolist()) for n, t in b.heads
     ]
     for field in fields(FileContent):
-        if field.name not in (*ROWS, "heads"):
+        if field.name not in (*ROWS, "heads", "levels"):
             assert getattr(a, field.name) == getattr(b, field.name), field.name
 
 
@@ -82,7 +82,8 @@ def _plain(prior: IntegerNetwork | tuple[HyperTable, ...]) -> list:
     if isinstance(prior, tuple):
         return [(table.lowest, table.levels.tolist()) for table in prior]
     layers = [(x.weight.tolist(), x.bias.tolist(), x.shift, x.rectify, x.adds) for x in prior.layers]
-    return [prior.skip, layers]
+    follow = prior.follow and (prior.follow.weight.tolist(), prior.follow.shift)
+    return [prior.skip, layers, follow]
 
 
 @st.composite
@@ -100,7 +101,8 @@ def chains(draw: st.DrawFn) -> tuple[GroupShape, ...]:
         steps = tuple(2.0**-i for i in range(count))
         free = [i for i, shape in enumerate(shapes) if shape.role != Role.RESIDUAL]
         context = draw(st.sets(st.sampled_from(free))) if free else set()
-        shapes.append(GroupShape(role, channels, steps, tuple(sorted(context)), draw(st.booleans())))
+        coordinates, neighbours = draw(st.booleans()), role != Role.RESIDUAL and draw(st.booleans())
+        shapes.append(GroupShape(role, channels, steps, tuple(sorted(context)), coordinates, neighbours))
     return tuple(shapes)
 
 
@@ -116,9 +118,6 @@ dimensions = st.builds(
 
 def slow_network(network: IntegerNetwork, row: list[int]) -> list[int]:
     """One row through a network, in Python's own integers."""
-
-    def clamp(v: int) -> int:
-        return max(-(1 << 23), min(v, (1 << 23) - 1))
 
     inputs = [clamp(v) for v in row]
     before, taken = inputs, inputs
@@ -137,14 +136,47 @@ def slow_network(network: IntegerNetwork, row: list[int]) -> list[int]:
     return taken
 
 
+def clamp(v: int) -> int:
+    return max(-(1 << 23), min(v, (1 << 23) - 1))
+
+
+def slow_neighbours(own: list[int], known: list[list[int]], shift: int) -> list[tuple[int, int]]:
+    """Numbers of neighbours, and their weights."""
+    return [
+        (j, 1 + (1 << 24) // sum(abs(a - b) for a, b in zip(own, other, strict=True)))
+        for j, other in enumerate(known)
+        if all(abs((a >> shift) - (b >> shift)) <= 1 for a, b in zip(own, other, strict=True))
+    ]
+
+
+def slow_around(
+    near: list[tuple[int, int]], latents: list[list[int]], biases: list[int]
+) -> tuple[list[int], list[int]]:
+    """known and activity; around."""
+    if not near:
+        return [0, 0], [0] * len(biases)
+    total = sum(w for _, w in near)
+    deviations = {j: [clamp(x - b) for x, b in zip(latents[j], biases, strict=True)] for j, _ in near}
+    activity = sum(w * (sum(map(abs, deviations[j])) // len(biases)) for j, w in near) // total
+    around = [sum(w * deviations[j][c] for j, w in near) // total for c in range(len(biases))]
+    return [4096, activity], around
+
+
 def slow_latents(content: FileContent) -> list[np.ndarray]:
     """Slow twin of `dequantize`: an anchor at a time walks the chain; of residuals the slots that exist."""
     low = [min(column) // 16 * 16 for column in content.coordinates.T.tolist()]
     depth = 0
     while max(v - low[a] for row in content.coordinates.tolist() for a, v in enumerate(row)) >> depth:
         depth += 1
+    offsets = [[v - low[a] for a, v in enumerate(row)] for row in content.coordinates.tolist()]
+    counts, levels = level_counts(content.coordinates).tolist(), content.levels
+    assert levels is not None
     rows: list[list[list[int]]] = [[] for _ in content.groups]
     for n, coordinates in enumerate(content.coordinates.tolist()):
+        before = max((level for level in levels if counts[level] <= n), default=None)
+        near = []
+        if before is not None:
+            near = slow_neighbours(offsets[n], offsets[: counts[before]], depth - before)
         place = [((2 * (v - low[a]) + 1) * 4096 >> depth) - 4096 for a, v in enumerate(coordinates)]
         latents: list[list[int]] = []
         for i, group in enumerate(content.groups):
@@ -152,7 +184,21 @@ def slow_latents(content: FileContent) -> list[np.ndarray]:
             means = [0] * sum(map(len, slots))
             if isinstance(group.prior, IntegerNetwork):
                 context = place if group.shape.sees_coordinates else []
-                means = slow_network(group.prior, sum((latents[j] for j in group.shape.context), context))
+                context = sum((latents[j] for j in group.shape.context), context)
+                if group.shape.sees_neighbours:
+                    biases = group.prior.layers[-1].bias[: group.shape.channels].tolist()
+                    two, around = slow_around(near, rows[i], biases)
+                    context = context + two
+                means = slow_network(group.prior, context)
+                if group.shape.sees_neighbours:
+                    follow, shift = group.prior.follow.weight.tolist(), group.prior.follow.shift
+                    moved = [
+                        (f * a + (1 << shift >> 1)) >> shift for f, a in zip(follow, around, strict=True)
+                    ]
+                    steps = [
+                        (m - b + v + 2048) // 4096 for m, b, v in zip(means, biases, moved, strict=False)
+                    ]
+                    means = [clamp(b + 4096 * step) for b, step in zip(biases, steps, strict=True)]
             values = [
                 [4096 * q + means[k * len(slot) + c] for c, q in enumerate(slot)]
                 for k, slot in enumerate(slots)
@@ -171,14 +217,20 @@ def slow_latents(content: FileContent) -> list[np.ndarray]:
     dimensions,
     st.sampled_from([0.0, 0.3, 1.0]),
     st.sampled_from([(0, 8), (1, 3), (2, 7)]),
+    st.floats(0, 1),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_any_chain_of_groups_comes_back_with_the_latents_of_a_slow_twin(
-    anchors: int, seed: int, d: Dimensions, kept: float, network: tuple[int, int]
+    anchors: int, seed: int, d: Dimensions, kept: float, network: tuple[int, int], ranges: float
 ) -> None:
     content = make_content(anchors, seed, d, kept=kept, blocks=network[0], hidden=network[1])
-    data = write_content(content)
+    counts = level_counts(content.coordinates)
+    rng = np.random.default_rng(seed)
+    brings = np.flatnonzero(np.diff(counts[:-1], prepend=0) * (counts[:-1] < counts[-1]))
+    levels = [int(level) for level in brings if rng.random() < ranges] + [len(counts) - 1]
+    data = write_content(content, levels=levels)
     read, latents = read_latents(data)
+    assert read.levels == tuple(levels)
     assert_same(read, content)
     assert (canonical_order(read.coordinates) == np.arange(anchors)).all()
     assert write_content(read) == data
@@ -212,7 +264,7 @@ def test_dequantized_latents_are_symbols_plus_predicted_means() -> None:
 def test_the_corners_of_the_octree_are_at_plus_and_minus_one() -> None:
     """Voxels 0 and 63 of 64 are half a voxel inside of them; the origin is a multiple of 16."""
     coordinates = np.array([[-32, -17, 5], [31, -32, 0]], np.int32)
-    places = coordinate_context(coordinates) / 4096
+    places = surroundings(coordinates).places / 4096
     assert places[0].tolist() == [1 / 64 - 1, 31 / 64 - 1, 11 / 64 - 1]
     assert places[1].tolist() == [127 / 64 - 1, 1 / 64 - 1, 1 / 64 - 1]
 

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,13 +23,19 @@ from compgs.stored_weights import SHARED_RESIDUAL_BITS
 from compgs.trained_model import TrainedModel
 from compgs.training.decorrelation import keep_channels
 
-OWN_RESIDUALS = Config(model=ModelConfig(residuals=True))
+OWN_RESIDUALS = Config(model=ModelConfig(residuals=True, reference_context="hyperprior"))
 
 
-def config_of(blocks: int, residuals: bool = True, width: int = 16) -> Config:
-    """The paper's kind of entropy model with blocks; that of small files, without hyperprior, without them."""
+SHARED = Config(model=ModelConfig(reference_context="hyperprior"))
+
+
+def config_of(blocks: int, residuals: bool = True, width: int = 16, context: Any = None) -> Config:
+    """The paper's kind of entropy model with blocks; without them that of small files, where references have no
+    context, or another one.
+    """
+    context = context or ("hyperprior" if blocks else "none")
     return Config(
-        model=ModelConfig(residuals=residuals, hyperprior=blocks > 0),
+        model=ModelConfig(residuals=residuals, reference_context=context),
         entropy=EntropyConfig(network_blocks=blocks, network_width=width),
     )
 
@@ -53,11 +60,14 @@ def by_position(primitives) -> dict[tuple[int, ...], int]:
     return {tuple(v): i for i, v in enumerate(voxels)}
 
 
-@pytest.mark.parametrize("blocks", [0, 2])
+@pytest.mark.parametrize(("blocks", "context"), [(0, "none"), (0, "neighbours"), (2, "hyperprior")])
 @pytest.mark.parametrize("residuals", [True, False])
-def test_the_decoded_scene_is_the_one_that_training_rendered(tmp_path, blocks, residuals):
-    model = made_model(config=config_of(blocks, residuals))
+def test_the_decoded_scene_is_the_one_that_training_rendered(tmp_path, blocks, context, residuals):
+    model = made_model(1500, config=config_of(blocks, residuals, context=context))
     with torch.no_grad():
+        for network in model.entropy.reference_networks:
+            for parameter in network.per_channel:
+                parameter.uniform_(-0.3, 0.9)
         model.entropy.log_covariance_step.add_(torch.linspace(-0.5, 0.5, 6))  # six steps
     encode(model, tmp_path / "a.cgs")
     trained, decoded = model.as_hybrid_model(), decode(tmp_path / "a.cgs")
@@ -197,7 +207,7 @@ def test_symbols_do_not_depend_on_the_number_of_threads(threads):
 
 def test_shared_residuals_are_in_the_file_though_no_symbol_is(tmp_path):
     """All anchors have the same K, as a tensor beside the heads' weights, and as training saw it."""
-    model = made_model(500, config=Config())
+    model = made_model(500, config=SHARED)
     assert len(model.residuals) == 1
     with torch.no_grad():
         model.residuals.normal_(0, 2, generator=torch.Generator().manual_seed(1))
@@ -216,7 +226,7 @@ def test_shared_residuals_are_in_the_file_though_no_symbol_is(tmp_path):
 
 def test_without_a_hyperprior_each_channel_of_the_references_has_one_mean_and_one_scale():
     """A network on the anchors' coordinates, of zeros, which take no byte each."""
-    config = Config(model=ModelConfig(hyperprior=False))
+    config = Config(model=ModelConfig(reference_context="none"))
     content = to_content(made_model(2000, config=config))
     references, log_scales = content.groups
     assert (references.shape.role, references.shape.context) == (Role.REFERENCE, ())
@@ -225,7 +235,10 @@ def test_without_a_hyperprior_each_channel_of_the_references_has_one_mean_and_on
     (layer,) = references.prior.layers
     assert layer.weight.shape == (64, 3) and not layer.weight.any()
     sizes = {s.name: s.bytes for s in file_info(write_content(content)).sections}
-    other = to_content(made_model(2000, config=Config(entropy=EntropyConfig(reference_hyper_dim=1))))
+    one_channel = Config(
+        model=ModelConfig(reference_context="hyperprior"), entropy=EntropyConfig(reference_hyper_dim=1)
+    )
+    other = to_content(made_model(2000, config=one_channel))
     with_one = {s.name: s.bytes for s in file_info(write_content(other)).sections}
     assert sizes["entropy networks"] < with_one["entropy networks"] - 40
     assert "reference hyperprior" not in sizes and sizes["tables"] == 0
@@ -333,7 +346,7 @@ def test_an_entropy_model_of_every_kind_is_written_as_the_paper_has_it():
             assert group.prior.skip
 
 
-@pytest.mark.parametrize("config", [OWN_RESIDUALS, Config()])
+@pytest.mark.parametrize("config", [OWN_RESIDUALS, SHARED])
 def test_each_network_is_evaluated_once_for_each_block_of_rows(config, tmp_path, monkeypatch):
     seen = []
 

@@ -24,6 +24,7 @@ from compgs.codec.format import (
     unpack,
 )
 from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile, TruncatedSection, UnsupportedVersion
+from compgs.ordering import neighbours
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "bitstream.md"
 
@@ -84,7 +85,7 @@ def test_truncation_names_the_section() -> None:
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"version": 3}, UnsupportedVersion, "version 3.*newer compgs"),
+        ({"version": 4}, UnsupportedVersion, "version 4.*newer compgs"),
         ({"version": 1}, UnsupportedVersion, "version 1.*encode the scene again"),
         ({"version": 0}, UnsupportedVersion, "version 0"),
         ({"flags": 1}, CorruptSection, "flags"),
@@ -189,7 +190,7 @@ def test_a_beginning_is_not_taken_for_a_damaged_file() -> None:
 def test_document_and_code_agree_on_the_constants() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     stated = dict(re.findall(r"^\| `([A-Z_0-9]+)` \| ([^|]+?) \|", text, re.MULTILINE))
-    modules = [format, content, fields, integer_network, latents, rans, sections, tables, weights]
+    modules = [format, content, fields, integer_network, latents, neighbours, rans, sections, tables, weights]
     assert len(stated) >= 30
     for name, value in stated.items():
         found = [getattr(m, name) for m in modules if hasattr(m, name)]

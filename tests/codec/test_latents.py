@@ -8,14 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compgs.codec.anchor_order import level_counts
 from compgs.codec.content import FileContent, GroupShape, Latents, Role, dequantize
 from compgs.codec.fields import FieldReader, varint
-from compgs.codec.format import LATENTS, MAX_RANGES, Section, pack, section_ends, unpack
-from compgs.codec.latents import RangeHead, chosen_levels, read_head
+from compgs.codec.format import LATENTS, MAX_RANGES, Section, pack, section_ends, unpack, version_of
+from compgs.codec.latents import RangeHead, read_head
 from compgs.codec.reader import RangeInfo, file_info, read_content, read_latents
 from compgs.codec.writer import write_content
 from compgs.errors import CorruptSection, TruncatedSection
+from compgs.ordering.order import level_counts
+from compgs.ordering.ranges import chosen_levels
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from made_content import make_content, make_dimensions, paper_groups
@@ -138,7 +139,7 @@ def with_head(data: bytes, index: int, head: RangeHead) -> bytes:
     read_head(reader)
     forged = bytes([head.level]) + varint(head.anchors) + varint(head.coupled)
     sections[at] = Section(LATENTS, forged + sections[at].data[reader.position :])
-    return pack(sections)
+    return pack(sections, version_of(data))
 
 
 @pytest.mark.parametrize("prefix", [False, True])

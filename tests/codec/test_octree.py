@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from compgs.codec.anchor_order import canonical_order
 from compgs.codec.octree import ANCHORS_PER_BYTE, MAXIMUM_ANCHORS, decode_positions, encode_positions
 from compgs.errors import BitstreamError, CorruptSection, NotEncodable
+from compgs.ordering.order import canonical_order
 
 CLOUDS = Path(__file__).parents[3] / "shared" / "clouds"
 

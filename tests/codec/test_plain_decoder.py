@@ -24,7 +24,8 @@ import plain_decoder  # noqa: E402
 from made_content import make_content, make_dimensions, paper_groups  # noqa: E402
 
 GOLDEN = ROOT / "tests" / "golden"
-FILES = [path for path in sorted(GOLDEN.glob("*.cgs")) if path.read_bytes()[4] == plain_decoder.VERSION]
+VERSIONS = range(plain_decoder.OLDEST_VERSION, plain_decoder.VERSION + 1)
+FILES = [path for path in sorted(GOLDEN.glob("*.cgs")) if path.read_bytes()[4] in VERSIONS]
 LATENTS, PADDING = 8, 130
 LARGEST_SYMBOL = 2**18
 
@@ -136,7 +137,10 @@ def _random_groups(rng: np.random.Generator) -> tuple[GroupShape, ...]:
         steps = tuple(rng.uniform(0.01, 2, rng.choice([1, channels])).astype(np.float32).tolist())
         before = [j for j, group in enumerate(groups) if group.role != Role.RESIDUAL and rng.random() < 0.4]
         sees = bool(rng.random() < 0.4)
-        groups.append(GroupShape(role, channels, () if role == Role.SIDE else steps, tuple(before), sees))
+        around = role != Role.RESIDUAL and bool(rng.random() < 0.4)
+        groups.append(
+            GroupShape(role, channels, () if role == Role.SIDE else steps, tuple(before), sees, around)
+        )
     return tuple(groups)
 
 

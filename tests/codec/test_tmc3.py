@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from compgs.codec.anchor_order import canonical_order
 from compgs.codec.reader import file_info, read_content
 from compgs.codec.tmc3 import (
     ASKED_BY,
@@ -21,6 +20,7 @@ from compgs.codec.tmc3 import (
 )
 from compgs.codec.writer import write_content
 from compgs.errors import CorruptSection, MissingDependency, NotEncodable
+from compgs.ordering.order import canonical_order
 
 # Stores the points as they are, but backwards: TMC13 has an order of its own.
 STAND_IN = """#!{python}

@@ -5,7 +5,7 @@ from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy.gaussian import scale_from_index
 from compgs.entropy.models import make_entropy_model
 
-MODEL = ModelConfig(hyperprior=False, coupled_primitives=3, reference_dim=6, residual_dim=4)
+MODEL = ModelConfig(reference_context="none", coupled_primitives=3, reference_dim=6, residual_dim=4)
 
 
 @pytest.fixture

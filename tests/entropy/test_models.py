@@ -10,7 +10,9 @@ from compgs.entropy.gaussian import gaussian_bits, scale_from_index
 from compgs.entropy.models import make_entropy_model
 from compgs.entropy.network import EntropyNetwork
 
-MODEL = ModelConfig(coupled_primitives=3, reference_dim=6, residuals=True, residual_dim=4)
+MODEL = ModelConfig(
+    coupled_primitives=3, reference_dim=6, residuals=True, residual_dim=4, reference_context="hyperprior"
+)
 ENTROPY = EntropyConfig(reference_hyper_dim=2)
 BLOCKS = EntropyConfig(reference_hyper_dim=2, network_blocks=2, network_width=7)
 

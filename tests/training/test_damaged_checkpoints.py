@@ -124,7 +124,7 @@ def test_the_state_is_checked(
         ("voxel_size", 0.0), ("voxel_size", float("nan")), ("voxel_size", "1"), ("distance_unit", -1.0),
         ("background", [0, 0]), ("background", None), ("world_offset", [0, 0, float("inf")]), ("up", []),
         ("viewpoints", [{}]), ("viewpoints", 7), ("viewpoints", [{"fx": 1}]), ("width", 0),
-        ("heads", "both"), ("heads", 1), ("hyperprior", 1), ("residuals", "no"),
+        ("heads", "both"), ("heads", 1), ("reference_context", 1), ("reference_context", "all"), ("residuals", "no"),
         ("width", 7), ("width", 1e3), ("width", None), ("head_bits", 0), ("head_bits", 17), ("head_bits", "7"),
         ("head_bits", True),
     ],

@@ -24,10 +24,13 @@ CPU = torch.device("cpu")
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
-def trained(scene: Scene, config: Config, steps: int = 12, **entropy: object) -> Trainer:
+def trained(
+    scene: Scene, config: Config, steps: int = 12, context: str = "hyperprior", **entropy: object
+) -> Trainer:
     """A short run without turns and prunings, on latents whose channels have much in common."""
     config = replace(
         config,
+        model=replace(config.model, reference_context=context),
         entropy=replace(config.entropy, decorrelate_at=(), **entropy),
         control=replace(config.control, prune_at=()),
     )
@@ -53,12 +56,12 @@ def predicted(trainer: Trainer) -> tuple[torch.Tensor, ...]:
 
 
 @pytest.mark.parametrize("heads", ["paired", "separate"])
-@pytest.mark.parametrize("residuals", [True, False])
+@pytest.mark.parametrize(("residuals", "context"), [(True, "hyperprior"), (False, "neighbours")])
 def test_without_rounding_the_scene_stays_the_same(
-    blob_scene: Scene, tiny_config: Config, heads: str, residuals: bool
+    blob_scene: Scene, tiny_config: Config, heads: str, residuals: bool, context: str
 ) -> None:
     model = replace(tiny_config.model, heads=heads, residuals=residuals)
-    trainer = trained(blob_scene, replace(tiny_config, model=model), quantized=False)
+    trainer = trained(blob_scene, replace(tiny_config, model=model), context=context, quantized=False)
     before = predicted(trainer)
     was = trainer.model.references.detach().clone()
     decorrelate(trainer.model, trainer.optimizer)
@@ -110,10 +113,13 @@ def test_channels_are_uncorrelated_afterwards_and_the_largest_come_first(
     np.testing.assert_allclose(variances.sum(), np.trace(before), rtol=1e-5)
 
 
-def test_correlated_references_take_fewer_bits_in_their_axes(blob_scene: Scene, tiny_config: Config) -> None:
-    trainer = trained(blob_scene, tiny_config)
+@pytest.mark.parametrize("context", ["hyperprior", "neighbours", "none"])
+def test_correlated_references_take_fewer_bits_in_their_axes(
+    blob_scene: Scene, tiny_config: Config, context: str
+) -> None:
+    trainer = trained(blob_scene, tiny_config, context=context)
     model = trainer.model
-    model.entropy.restart_reference_scales(model.references)
+    model.entropy.restart_reference_scales(model.references, model.around)
     before = model.estimated_bits()
     decorrelate(model, trainer.optimizer)
     after = model.estimated_bits()

@@ -69,7 +69,7 @@ def trained(kind: type, scene: Scene, config) -> tuple:
     return trainer, SplatModel(trainer.parameters.trained().arrays(), scene.background)
 
 
-@pytest.mark.parametrize(("kind", "steps"), [(Trainer, 160), (SplatTrainer, 240)])
+@pytest.mark.parametrize(("kind", "steps"), [(Trainer, 200), (SplatTrainer, 240)])
 def test_known_exposures_are_recovered_and_pay_on_held_out_views(
     blob_scene, blob_view, tiny_config, kind, steps
 ) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from compgs.config import Config
-from compgs.training.network_size import has_hyperprior, head_bits, head_layout, hidden_width
+from compgs.training.network_size import head_bits, head_layout, hidden_width, reference_context
 
 
 def priced(config: Config, lmbda: float, **model: object) -> Config:
@@ -59,13 +59,13 @@ def test_a_size_that_is_asked_for_decides_whatever_lambda_begins_with() -> None:
         (100, 4500, {"lmbda": 1e-5}, "separate"),
         (100, 4499, {"lmbda": 1e-5}, "paired"),  # too short
         (100, 4500, {"lmbda": 2e-5}, "paired"),  # bits cost
-        (12, 4500, {"lmbda": 1e-5}, "paired"),  # few views would be learned by heart
-        (0, 4500, {"lmbda": 1e-5}, "paired"),
+        (12, 540, {"lmbda": 1e-5}, "separate"),  # few views are soon seen often
+        (12, 539, {"lmbda": 1e-5}, "paired"),
         (100, 4500, {"lmbda": 0.002, "target_bytes": 80_000}, "separate"),
         (100, 4500, {"lmbda": 1e-5, "target_bytes": 79_999}, "paired"),
     ],
 )
-def test_networks_are_separate_at_the_top_of_long_runs(
+def test_networks_are_separate_at_the_top_of_runs_that_see_their_views_often(
     views: int, steps: int, asked: dict[str, float], layout: str
 ) -> None:
     training = replace(Config().training, steps=steps, **asked)  # type: ignore[arg-type]
@@ -77,14 +77,17 @@ def test_networks_are_separate_at_the_top_of_long_runs(
     assert head_layout(given, 2000, views) == "separate"
 
 
-def test_there_is_a_hyperprior_where_networks_are_as_wide_as_they_are_asked_to_be() -> None:
+def test_references_have_a_context_where_networks_are_as_wide_as_they_are_asked_to_be() -> None:
     for lmbda in (1e-6, 1e-3, 5e-3, 1e-2, 0.1):
         config = priced(Config(), lmbda)
-        assert has_hyperprior(config, 6000) == (hidden_width(config, 6000) == 32)
-        assert not has_hyperprior(priced(Config(), lmbda, hyperprior=False), 6000)
+        wide = hidden_width(config, 6000) == 32
+        for asked in ("neighbours", "hyperprior", "none"):
+            other = replace(config, model=replace(config.model, reference_context=asked))
+            assert reference_context(other, 6000) == (asked if wide else "none")
         fixed = replace(config, model=replace(config.model, networks_by_price=False))
-        assert has_hyperprior(fixed, 6000)
-    for size, kept in ((9_000, False), (26_000, False), (26_001, True)):
-        asked = replace(Config(), training=replace(Config().training, target_bytes=size))
-        assert has_hyperprior(asked, 6000) == kept
-    assert has_hyperprior(priced(Config(), 1e-6, width=8), 6000), "narrow, but not for the price of a bit"
+        assert reference_context(fixed, 6000) == "neighbours"
+    for size, context in ((9_000, "none"), (26_000, "none"), (26_001, "neighbours")):
+        small = replace(Config(), training=replace(Config().training, target_bytes=size))
+        assert reference_context(small, 6000) == context
+    narrow = priced(Config(), 1e-6, width=8)
+    assert reference_context(narrow, 6000) == "neighbours", "narrow, but not for the price of a bit"

@@ -115,13 +115,13 @@ def test_a_run_with_few_views_trains_encodes_and_resumes_with_residuals_of_its_o
     assert not shared.own_residuals and len(shared.residuals) == 1
 
 
-def test_a_run_for_a_small_file_trains_resumes_and_encodes_without_a_hyperprior(
+def test_a_run_for_a_small_file_trains_resumes_and_encodes_without_a_context(
     blob_scene: Scene, tiny_config: Config, tmp_path: Path
 ) -> None:
     model = replace(tiny_config.model, networks_by_price=True)
     config = replace(tiny_config, model=model, training=replace(tiny_config.training, lmbda=0.05))
     whole = Trainer(blob_scene, config, torch.device("cpu"))
-    assert not whole.model.entropy.has_hyperprior
+    assert whole.model.entropy.context_of_references == "none"
     whole.run(None, None)
     first = Trainer(blob_scene, config, torch.device("cpu"))
     for _ in range(15):

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from compgs.config import Config
+from compgs.entropy.neighbourhood import neighbourhood
 from compgs.render import RasterResult
 from compgs.tensors.visibility import visible_mask
 from compgs.training import loop as loop_module
@@ -31,7 +32,9 @@ def rasterize_nothing(gaussians, camera, settings) -> RasterResult:
 
 def valueless_trainer(scene, config: Config, monkeypatch) -> Trainer:
     trainer = Trainer(scene, config, torch.device("cpu"))
+    found = neighbourhood(trainer.model.coordinates).to(META)
     trainer.model.to(META)
+    trainer.model._neighbourhood = (trainer.model.coordinates, found)  # (looked for where anchors change)
     trainer.device = trainer.views.device = META
     trainer.noise.pool = trainer.noise.pool.to(META)
     for name in trainer.control.STATISTICS:

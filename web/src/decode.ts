@@ -25,8 +25,8 @@ export function decode(data: ArrayBuffer | Uint8Array, options: DecodeOptions = 
   let bytes = data instanceof Uint8Array ? data : new Uint8Array(data);
   if (typeof prefix === "number") bytes = bytes.subarray(0, Math.max(0, prefix));
   const isPrefix = prefix !== false;
-  const { sections, hasAllLatents } = unpack(bytes, isPrefix);
-  const decoder = new SceneDecoder(sections, kernels, bytes.length, !isPrefix);
+  const { version, sections, hasAllLatents } = unpack(bytes, isPrefix);
+  const decoder = new SceneDecoder(version, sections, kernels, bytes.length, !isPrefix);
   for (const section of sections) {
     if (section.number === SectionNumber.latents) decoder.addRange(section, bytes.length);
   }

@@ -1,12 +1,6 @@
 /** A scene from the bytes of a file as they arrive: coarse first, finer with each range that is complete. */
 
-import {
-  type Section,
-  type SectionEntry,
-  SectionNumber,
-  readHeader,
-  unpackSection,
-} from "./codec/container.ts";
+import { type Header, type Section, SectionNumber, readHeader, unpackSection } from "./codec/container.ts";
 import type { Kernels } from "./codec/kernels.ts";
 import { plainKernels } from "./codec/plain_kernels.ts";
 import { type Scene, SceneDecoder } from "./codec/scene_decoder.ts";
@@ -17,7 +11,7 @@ const MAX_HEADER_BYTES = 7 + 255 * 9 + 4;
 export class ProgressiveDecoder {
   private bytes = new Uint8Array(1 << 16);
   private length = 0;
-  private entries: SectionEntry[] | null = null;
+  private header: Header | null = null;
   /** Sections whose bytes are there, their checksums verified, that no decoder has seen yet. */
   private waiting: Section[] = [];
   private next = 0;
@@ -27,17 +21,18 @@ export class ProgressiveDecoder {
 
   /** Bytes of the whole file as its header has it, or null before the header is there. */
   get expectedBytes(): number | null {
-    const last = this.entries?.[this.entries.length - 1];
+    const last = this.header?.entries[this.header.entries.length - 1];
     return last ? last.start + last.length : null;
   }
 
   /** Takes more of the file. True if a finer scene can be had. Throws as `decode` does. */
   push(chunk: Uint8Array): boolean {
     this.append(chunk);
-    if (!this.entries && !this.tryHeader(false)) return false;
+    if (!this.header && !this.tryHeader(false)) return false;
+    const { entries } = this.header!;
     let isFiner = false;
-    for (; this.next < this.entries!.length; this.next++) {
-      const entry = this.entries![this.next]!;
+    for (; this.next < entries.length; this.next++) {
+      const entry = entries[this.next]!;
       if (entry.start + entry.length > this.length) break;
       isFiner = this.take(unpackSection(this.bytes.subarray(0, this.length), entry)) || isFiner;
     }
@@ -46,8 +41,8 @@ export class ProgressiveDecoder {
 
   /** Says that all bytes are there; throws if they are not the whole of a file. */
   finish(): void {
-    if (!this.entries) this.tryHeader(true);
-    const missing = this.entries![this.next];
+    if (!this.header) this.tryHeader(true);
+    const missing = this.header!.entries[this.next];
     if (missing) {
       throw new TruncatedSection(
         `${missing.name}: header promises ${missing.length} bytes, file ends after ${this.length - missing.start}`,
@@ -76,7 +71,7 @@ export class ProgressiveDecoder {
   /** Whether the header is there. One that is only not there yet is no error before the end. */
   private tryHeader(isEnd: boolean): boolean {
     try {
-      this.entries = readHeader(this.bytes.subarray(0, this.length));
+      this.header = readHeader(this.bytes.subarray(0, this.length));
       return true;
     } catch (error) {
       const mayCome = error instanceof TruncatedSection && !isEnd && this.length < MAX_HEADER_BYTES;
@@ -91,7 +86,7 @@ export class ProgressiveDecoder {
       else this.waiting.push(section);
       return false;
     }
-    this.decoder ??= new SceneDecoder(this.waiting, this.kernels, this.length, false);
+    this.decoder ??= new SceneDecoder(this.header!.version, this.waiting, this.kernels, this.length, false);
     this.decoder.addRange(section, this.length);
     return true;
   }

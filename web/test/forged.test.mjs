@@ -3,10 +3,11 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { crc32 } from "node:zlib";
-import { compgs, goldenFiles } from "./fixtures.mjs";
+import { compgs, goldenFiles, hashesOf } from "./fixtures.mjs";
 
 const { Predictor, decode } = compgs;
-const [POSITIONS, GPCC, MASKS, HEADS, LATENTS] = [2, 3, 4, 7, 8];
+const [SCENE, POSITIONS, GPCC, MASKS, HEADS, LATENTS] = [1, 2, 3, 4, 7, 8];
+const [REFERENCE, RESIDUAL] = [1, 3];
 const [METADATA, PADDING, VIEWPOINTS, UNKNOWN] = [129, 130, 131, 200];
 /** One lens of 4 x 3 pixels, one view, of which `rotation` is six bytes. */
 const viewpoints = (rotation) => {
@@ -33,9 +34,9 @@ function sectionsOf(bytes) {
   });
 }
 
-function fileOf(sections) {
+function fileOf(sections, version = files[0].bytes[4]) {
   const head = Buffer.alloc(7 + 9 * sections.length);
-  head.set([0x93, 0x43, 0x47, 0x53, 2, 0, sections.length]);
+  head.set([0x93, 0x43, 0x47, 0x53, version, 0, sections.length]);
   sections.forEach(({ number, payload }, i) => {
     head[7 + 9 * i] = number;
     head.writeUInt32LE(payload.length, 8 + 9 * i);
@@ -46,11 +47,24 @@ function fileOf(sections) {
   return Buffer.concat([head, check, ...sections.map(({ payload }) => payload)]);
 }
 
+/** Of each group that a scene section describes, its role and where its context is. */
+function groupsOf(scene) {
+  let at = 66;
+  return Array.from({ length: scene[65] }, () => {
+    const [role, context, steps] = [scene[at], at + 2, scene[at + 3]];
+    at += 4 + 4 * steps;
+    return { role, context };
+  });
+}
+
 const files = goldenFiles().filter(
   ({ bytes }) => sectionsOf(bytes).filter((s) => s.number === LATENTS).length > 1,
 );
 assert.ok(files.length > 0);
 const original = sectionsOf(files[0].bytes);
+// A file of version 2 with each role.
+const { bytes: paperBytes, hashes: paperHashes } = goldenFiles().find(({ name }) => name === "paper");
+const paper = sectionsOf(paperBytes);
 const without = (number) => original.filter((section) => section.number !== number);
 const withOne = (number, payload) => [...without(number), { number, payload: Buffer.from(payload) }];
 const refuses = (sections, name, message, options) =>
@@ -61,6 +75,32 @@ const refuses = (sections, name, message, options) =>
 
 test("what was taken apart is put together as it was", () => {
   assert.deepEqual(fileOf(original), Buffer.from(files[0].bytes));
+});
+
+test("a file is of version 2 or 3", () => {
+  for (const version of [2, 3]) {
+    assert.deepEqual(hashesOf(decode(fileOf(paper, version))), paperHashes);
+  }
+  for (const version of [0, 1, 4, 255]) {
+    assert.throws(() => decode(fileOf(paper, version)), { name: "UnsupportedVersion" });
+  }
+});
+
+test("neighbours are of version 3, and not of residuals", () => {
+  const refusesContext = (role, version, message) => {
+    const scene = Buffer.from(paper[0].payload);
+    const index = groupsOf(scene).findIndex((group) => group.role === role);
+    scene[groupsOf(scene)[index].context] |= 2 << index;
+    const changed = [{ number: SCENE, payload: scene }, ...paper.slice(1)];
+    assert.throws(
+      () => decode(fileOf(changed, version)),
+      (thrown) => thrown.name === "CorruptSection" && message.test(thrown.message),
+    );
+  };
+  refusesContext(REFERENCE, 2, /^scene: context of group/);
+  refusesContext(REFERENCE, 3, /^entropy networks/); // its network has too few weights
+  refusesContext(RESIDUAL, 2, /^scene: context of group/);
+  refusesContext(RESIDUAL, 3, /^scene: .* residuals/);
 });
 
 test("ranges that leave anchors out are refused, as a whole file and as a beginning that has all its ranges", () => {

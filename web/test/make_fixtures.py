@@ -29,7 +29,6 @@ from made_content import make_content, make_dimensions, paper_groups  # noqa: E4
 from made_heads import make_heads  # noqa: E402
 
 from compgs.cameras import Camera  # noqa: E402
-from compgs.codec.anchor_order import canonical_order, level_counts  # noqa: E402
 from compgs.codec.content import FileContent, GroupShape, Latents, Role  # noqa: E402
 from compgs.codec.decoder import from_latents  # noqa: E402
 from compgs.codec.format import MAX_SYMBOL  # noqa: E402
@@ -37,6 +36,7 @@ from compgs.codec.reader import file_info, read_latents  # noqa: E402
 from compgs.codec.viewpoints import Viewpoint, Viewpoints  # noqa: E402
 from compgs.codec.writer import write_content  # noqa: E402
 from compgs.errors import BitstreamError  # noqa: E402
+from compgs.ordering.order import canonical_order, level_counts  # noqa: E402
 
 FIELDS = {"means": 3, "quaternions": 4, "scales": 3, "opacities": 1, "colors": 3}  # columns
 STEPS = (0.25, 0.25, 0.25, 0.0625, 0.125, 0.0625)
@@ -50,6 +50,15 @@ MANY_GROUPS = (
     GroupShape(Role.LOG_SCALES, 4, STEPS[2:], (1, 3)),
     GroupShape(Role.RESIDUAL, 1, (0.5,)),
     GroupShape(Role.RESIDUAL, 3, (1.0, 0.5, 0.25), (2, 3, 5), sees_coordinates=True),
+)
+# A network of each kind takes what neighbours have: alone, with other groups, with coordinates, behind both.
+NEIGHBOURS = (
+    GroupShape(Role.SIDE, 2, sees_neighbours=True),
+    GroupShape(Role.REFERENCE, 5, (0.5,), (0,), sees_neighbours=True),
+    GroupShape(Role.REFERENCE, 3, (0.5, 1.0, 2.0), (1,), sees_coordinates=True, sees_neighbours=True),
+    GroupShape(Role.SIDE, 1, sees_coordinates=True, sees_neighbours=True),
+    GroupShape(Role.LOG_SCALES, 6, STEPS, (0, 2), sees_neighbours=True),
+    GroupShape(Role.RESIDUAL, 2, (1.0,), (1, 3)),
 )
 MUTANTS = 150
 STARTS = (b"", b"\x93", b"\x93CG", b"CGS", b"\x93CGS", b"\x93CGS\2\0", b"\x93CGS\1\0\5", b"PK\3\4")
@@ -72,6 +81,12 @@ def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
         "no_coupled": (make_content(30, 7, shared, kept=-1.0), None),
         "wide": (make_content(120, 8, make_dimensions(64, paper_groups(4, 1, 1, 1)), kept=0.3), None),
     }
+    near = make_dimensions(3, NEIGHBOURS, width=16)
+    made["neighbours"] = (make_content(600, 13, near, kept=0.5, blocks=1), EVERY_LEVEL)
+    wild = make_content(900, 14, near, kept=0.5)
+    for group in wild.groups:
+        group.symbols[::7] *= 900  # beyond what a network takes
+    made["deep_neighbours"] = (replace(wild, coordinates=wild.coordinates * 7001), None)
     escapes = make_content(200, 9, make_dimensions(3, paper_groups(4, 2)))
     for group in escapes.groups:
         existing = group.symbols if group.shape.role != Role.RESIDUAL else group.symbols[escapes.mask]

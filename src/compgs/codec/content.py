@@ -12,24 +12,34 @@ means and scales that a network predicts from groups before it. The paper's entr
     3 side       z_g   tables
     4 residual   g     network of f_hat, z_g    g_hat = q_g + mean
 
-and other chains (several groups of one role, each given the one before; the anchors' coordinates as context) are
-written in the same format.
+and other chains (several groups of one role, each given the one before; as context the anchors' coordinates, or what
+anchors of earlier ranges have around) are written in the same format.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
-from compgs.codec.anchor_order import octree_depth, octree_origin
-from compgs.codec.integer_network import FRACTION_BITS, IntegerNetwork, entropy_parameters, first_rows
+from compgs.codec.integer_network import (
+    FRACTION_BITS,
+    IntegerNetwork,
+    entropy_parameters,
+    first_rows,
+    follow_neighbours,
+)
+from compgs.codec.neighbour_context import BESIDES, neighbour_context
 from compgs.codec.rans import escape_bits
 from compgs.codec.tables import FrequencyTables, HyperTable, channel_tables, gaussian_tables
 from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 from compgs.numerics.compiled import njit, portion
+from compgs.ordering.neighbours import Neighbours, find_neighbours
+from compgs.ordering.order import level_counts, octree_depth, octree_origin
+from compgs.ordering.ranges import chosen_levels
 
 LOG_SCALES = 6  # of an anchor: reach of the offsets, size of the primitives
 COORDINATES = 3  # inputs of a network that sees where its anchor is
@@ -53,11 +63,12 @@ class GroupShape:
     steps: tuple[float, ...] = ()  # quantization steps, float32: one, or one a channel; none with SIDE
     context: tuple[int, ...] = ()  # groups before this one, ascending, that its network takes
     sees_coordinates: bool = False  # whether the network takes the anchor's coordinates, before all else
+    sees_neighbours: bool = False  # whether it takes what anchors around have of this group, behind all else
 
     @property
     def has_network(self) -> bool:
         """Else its channels have tables."""
-        return bool(self.context) or self.sees_coordinates
+        return bool(self.context) or self.sees_coordinates or self.sees_neighbours
 
     def width(self, coupled_primitives: int) -> int:
         """Symbols of an anchor that has all its coupled primitives."""
@@ -93,13 +104,19 @@ class Dimensions:
 
     def network_size(self, group: GroupShape) -> tuple[int, int]:
         """(inputs, outputs) of a group's network; the outputs are means and scales."""
-        inputs = sum(self.groups[i].channels for i in group.context)
-        return inputs + COORDINATES * group.sees_coordinates, 2 * group.width(self.coupled_primitives)
+        inputs = COORDINATES * group.sees_coordinates + sum(self.groups[i].channels for i in group.context)
+        inputs += BESIDES * group.sees_neighbours
+        return inputs, 2 * group.width(self.coupled_primitives)
 
     @property
     def network_sizes(self) -> list[tuple[int, int]]:
         """Of the networks in the file's order."""
         return [self.network_size(g) for g in self.groups if g.has_network]
+
+    @property
+    def networks_that_follow(self) -> list[bool]:
+        """Which of them are of groups that see neighbours."""
+        return [g.sees_neighbours for g in self.groups if g.has_network]
 
     @property
     def table_count(self) -> int:
@@ -128,6 +145,8 @@ class FileContent:
     groups: tuple[Group, ...]
     heads: tuple[tuple[str, QuantizedTensor], ...]  # prediction networks' parameters by name
     viewpoints: Viewpoints | None = None  # where to look from
+    # Last octree level of each range, on which what neighbours have depends; None: as `chosen_levels`.
+    levels: tuple[int, ...] | None = None
     stands_for: np.ndarray | None = None  # of a prefix: [N] anchors of the whole scene for which each stands
     metadata: dict[str, str] = field(default_factory=dict)  # for people; no decoder depends on it
 
@@ -142,6 +161,18 @@ class FileContent:
             if group.shape.role == role:
                 return group
         raise KeyError(role)
+
+
+def reordered(content: FileContent, order: np.ndarray) -> FileContent:
+    """The content with its anchors in another order."""
+    if (order[1:] > order[:-1]).all():
+        return content
+    return replace(
+        content,
+        coordinates=content.coordinates[order],
+        mask=content.mask[order],
+        groups=tuple(replace(group, symbols=group.symbols[order]) for group in content.groups),
+    )
 
 
 # Of each group: dequantized latents, Q12, in units of their quantization step: [N, channels] int32; with RESIDUAL
@@ -162,18 +193,56 @@ def reconstruct(symbols: np.ndarray, means: np.ndarray) -> np.ndarray:  # int32,
     return means
 
 
-def coordinate_context(coordinates: np.ndarray) -> np.ndarray:
-    """[N, 3] voxels of all anchors -> [N, 3] int32 Q12, -1 to 1: where an anchor is in the scene's octree."""
-    origin = octree_origin(coordinates)
-    offsets = coordinates.astype(np.int64) - origin
-    depth = octree_depth(offsets)
-    return ((((2 * offsets + 1) << FRACTION_BITS) >> depth) - (1 << FRACTION_BITS)).astype(np.int32)
+@dataclass(frozen=True)
+class Surroundings:
+    """What is known of N anchors, in canonical order, before any of their latents."""
+
+    offsets: np.ndarray  # [N, 3] int32 from the octree's origin
+    depth: int  # of the octree
+    levels: tuple[int, ...]  # last one of each range
+    ends: tuple[int, ...]  # anchors up to there
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """[N, 3] int32 Q12, -1 to 1: where an anchor is in the octree."""
+        doubled = (2 * self.offsets.astype(np.int64) + 1) << FRACTION_BITS
+        return ((doubled >> self.depth) - (1 << FRACTION_BITS)).astype(np.int32)
+
+    def rows(self, number: int) -> slice:
+        """Anchors of a range."""
+        return slice(self.ends[number - 1] if number else 0, self.ends[number])
+
+    def neighbours(self, number: int) -> Neighbours:
+        """Of the anchors of a range, which is not the first."""
+        known, end = self.ends[number - 1], self.ends[number]
+        return find_neighbours(self.offsets[:end], known, self.depth - self.levels[number - 1])
+
+    def around(self, number: int, network: IntegerNetwork, earlier: np.ndarray) -> np.ndarray:
+        """`neighbour_context` of a range; earlier [M, C]: latents of the anchors of the ranges before."""
+        end = self.ends[number]
+        return neighbour_context(network, earlier, self.offsets[:end], lambda: self.neighbours(number))
 
 
-def network_context(shape: GroupShape, latents: Sequence[np.ndarray], places: np.ndarray) -> np.ndarray:
-    """[N, inputs] Q12 of a group's network, from the latents of the groups before it and `coordinate_context`."""
+def surroundings(coordinates: np.ndarray, levels: Sequence[int] | None = None) -> Surroundings:
+    """Of [N, 3] voxels in canonical order; `levels`: last octree level of each range, by default `chosen_levels`."""
+    offsets = coordinates.astype(np.int64) - octree_origin(coordinates)
+    depth, counts = octree_depth(offsets), level_counts(coordinates)
+    levels = chosen_levels(counts) if levels is None else levels
+    ends = tuple(int(counts[level]) for level in levels)
+    return Surroundings(offsets.astype(np.int32), depth, tuple(levels), ends)
+
+
+def network_context(
+    shape: GroupShape, latents: Sequence[np.ndarray], places: np.ndarray, around: np.ndarray | None = None
+) -> np.ndarray:
+    """[n, inputs] Q12 of a group's network, from the latents of the groups before it, where the anchors are
+    (`Surroundings.places`), and what the anchors around them have (`Surroundings.around`), if it sees that.
+    """
     parts = [places] if shape.sees_coordinates else []
     parts += [latents[i] for i in shape.context]
+    if shape.sees_neighbours:
+        assert around is not None
+        parts.append(around[:, :BESIDES])
     return parts[0] if len(parts) == 1 else np.concatenate(parts, 1)
 
 
@@ -181,16 +250,19 @@ def conditional_tables(
     shape: GroupShape,
     prior: IntegerNetwork | tuple[HyperTable, ...],
     latents: Sequence[np.ndarray],
-    places: np.ndarray,  # [N, 3] `coordinate_context`
-    mask: np.ndarray,  # [N, K] bool
+    places: np.ndarray,  # [n, 3] `Surroundings.places`
+    mask: np.ndarray,  # [n, K] bool
+    around: np.ndarray | None = None,  # [n, 2 + channels] `Surroundings.around`, if the group sees neighbours
 ) -> tuple[np.ndarray | None, np.ndarray, FrequencyTables]:
     """What encoder and decoder know of a group before its symbols: means (Q12; None for a group with tables), index of
-    each symbol's table, and the tables. [N, channels]; with RESIDUAL [P, channels].
+    each symbol's table, and the tables. [n, channels]; with RESIDUAL [p, channels].
     """
     slots = mask if shape.role == Role.RESIDUAL else np.ones((len(mask), 1), np.bool_)
     if isinstance(prior, IntegerNetwork):
-        context = network_context(shape, latents, places)
+        context = network_context(shape, latents, places, around)
         means, index = entropy_parameters(prior, context, slots)
+        if prior.follow is not None and around is not None:
+            follow_neighbours(prior, around[:, BESIDES:], means)
         return means, index, gaussian_tables()
     columns = np.arange(len(prior), dtype=np.uint8).reshape(slots.shape[1], shape.channels)
     return None, np.broadcast_to(columns, (len(mask), *columns.shape))[slots], channel_tables(prior)
@@ -255,26 +327,64 @@ class CodedGroup:
     latents: np.ndarray
 
 
-def walk(groups: Sequence[Group], mask: np.ndarray, places: np.ndarray) -> Iterator[CodedGroup]:
-    """Along the chain of groups, each given the ones before. mask: [N, K]; places: [N, 3] `coordinate_context`."""
+# Symbols of anchors of a group, given their means (None: it has tables) and the index of each symbol's table.
+SymbolsOf = Callable[[slice, np.ndarray | None, np.ndarray], np.ndarray]
+
+
+def code_group(
+    shape: GroupShape,
+    prior: IntegerNetwork | tuple[HyperTable, ...],
+    before: Sequence[np.ndarray],  # latents of the groups before
+    known: Surroundings,
+    mask: np.ndarray,  # [N, K]
+    symbols_of: SymbolsOf,
+) -> CodedGroup:
+    """A group of all anchors: at once, or range by range where it sees neighbours."""
+    if not shape.sees_neighbours:
+        means, index, tables = conditional_tables(shape, prior, before, known.places, mask)
+        symbols = symbols_of(slice(0, len(mask)), means, index)
+        latents = fixed_point(symbols) if means is None else reconstruct(symbols, means)
+        return CodedGroup(symbols, index, tables, latents)
+    assert isinstance(prior, IntegerNetwork)
+    symbols, latents = np.empty((2, len(mask), shape.channels), np.int32)
+    index, tables = np.empty(symbols.shape, np.uint8), gaussian_tables()
+    for number in range(len(known.ends)):
+        rows = known.rows(number)
+        said = known.around(number, prior, latents[: rows.start])
+        context = [x[rows] if i in shape.context else x for i, x in enumerate(before)]
+        means, index[rows], _ = conditional_tables(
+            shape, prior, context, known.places[rows], mask[rows], said
+        )
+        assert means is not None
+        symbols[rows] = symbols_of(rows, means, index[rows])
+        latents[rows] = reconstruct(symbols[rows], means)
+    return CodedGroup(symbols, index, tables, latents)
+
+
+def walk(groups: Sequence[Group], mask: np.ndarray, known: Surroundings) -> Iterator[CodedGroup]:
+    """Along the chain of groups, each given the ones before. mask: [N, K]."""
     latents: list[np.ndarray] = []
     for group in groups:
-        means, index, tables = conditional_tables(group.shape, group.prior, latents, places, mask)
-        symbols = existing_symbols(group, mask)
-        latents.append(fixed_point(symbols) if means is None else reconstruct(symbols, means))
-        yield CodedGroup(symbols, index, tables, latents[-1])
+        coded = code_group(group.shape, group.prior, latents, known, mask, _symbols_of(group, mask))
+        latents.append(coded.latents)
+        yield coded
+
+
+def _symbols_of(group: Group, mask: np.ndarray) -> SymbolsOf:
+    symbols = existing_symbols(group, mask)
+    return lambda rows, *_: symbols if group.shape.role == Role.RESIDUAL else symbols[rows]
 
 
 def dequantize(content: FileContent) -> Latents:
     """Latents of all anchors, exactly as any other decoder gets them."""
-    places = coordinate_context(content.coordinates)
-    return tuple(coded.latents for coded in walk(content.groups, content.mask, places))
+    known = surroundings(content.coordinates, content.levels)
+    return tuple(coded.latents for coded in walk(content.groups, content.mask, known))
 
 
 def cross_entropy_bits(content: FileContent) -> list[float]:
     """Code length of each group under the file's own integer tables, escapes included: what a perfect coder needs."""
-    places = coordinate_context(content.coordinates)
+    known = surroundings(content.coordinates, content.levels)
     return [
         float(sum(escape_bits(coded.symbols.ravel(), coded.table_index.ravel(), coded.tables)))
-        for coded in walk(content.groups, content.mask, places)
+        for coded in walk(content.groups, content.mask, known)
     ]

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from compgs import __version__
-from compgs.codec.anchor_order import canonical_order
 from compgs.codec.content import (
     LOG_SCALES,
     CodedGroup,
@@ -22,23 +21,24 @@ from compgs.codec.content import (
     Group,
     GroupShape,
     Role,
-    conditional_tables,
-    coordinate_context,
-    fixed_point,
-    reconstruct,
+    Surroundings,
+    code_group,
     scatter_existing,
+    surroundings,
 )
-from compgs.codec.integer_network import FRACTION_BITS, IntegerLayer, IntegerNetwork
+from compgs.codec.integer_network import FRACTION_BITS, Follow, IntegerLayer, IntegerNetwork
 from compgs.codec.tables import HyperTable, hyper_tables
 from compgs.codec.viewpoint_cameras import viewpoints_from_cameras
 from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 from compgs.codec.writer import Geometry, write_content
-from compgs.entropy.contexts import Hyperprior
+from compgs.entropy.contexts import Hyperprior, NoContext
 from compgs.entropy.models import OwnResidualsEntropyModel
+from compgs.entropy.neighbour_network import NeighbourNetwork
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
 from compgs.errors import NotEncodable
+from compgs.ordering.order import canonical_order
 from compgs.outputs import check_output_file, write_bytes
 from compgs.trained_model import TrainedModel
 
@@ -105,7 +105,7 @@ def _coded_model(model: TrainedModel, viewpoints: int | None) -> tuple[FileConte
     kept = kept[torch.from_numpy(canonical_order(model.coordinates.cpu()[kept].numpy()))]
     coordinates, mask = model.coordinates.cpu()[kept].numpy(), model.mask.cpu()[kept].numpy()
     d = model.dimensions
-    chain = _Chain(mask, coordinate_context(coordinates), model.weights.network)
+    chain = _Chain(mask, surroundings(coordinates), model.weights.network)
     for code in (_code_references, _code_log_scales, _code_residuals):
         code(chain, model, kept)
     content = FileContent(
@@ -125,6 +125,7 @@ def _coded_model(model: TrainedModel, viewpoints: int | None) -> tuple[FileConte
             for name, tensor in model.head_tensors().items()
         ),
         viewpoints=_viewpoints(model, viewpoints),
+        levels=chain.known.levels,
         metadata={"creator": f"compgs {__version__}"},
     )
     return content, chain.coded
@@ -138,9 +139,9 @@ def _viewpoints(model: TrainedModel, count: int | None) -> Viewpoints | None:
 class _Chain:
     """The groups of a file one after the other, each coded given the ones before."""
 
-    def __init__(self, mask: np.ndarray, places: np.ndarray, network_bits: int) -> None:
+    def __init__(self, mask: np.ndarray, known: Surroundings, network_bits: int) -> None:
         self.mask = mask  # [N, K] bool
-        self.places = places  # [N, 3] Q12
+        self.known = known
         self.network_bits = network_bits
         self.groups: list[Group] = []
         self.coded: list[CodedGroup] = []
@@ -162,10 +163,13 @@ class _Chain:
     def _add(self, shape: GroupShape, prior: IntegerNetwork | tuple[HyperTable, ...], y: np.ndarray) -> int:
         """`y` [N, channels] float64; with RESIDUAL [P, channels], of the coupled primitives that exist."""
         before = [group.latents for group in self.coded]
-        means, index, tables = conditional_tables(shape, prior, before, self.places, self.mask)
-        symbols = np.rint(y if means is None else y - means / ONE).astype(np.int32)
-        latents = fixed_point(symbols) if means is None else reconstruct(symbols, means)
-        self.coded.append(CodedGroup(symbols, index, tables, latents))
+
+        def symbols_of(rows: slice, means: np.ndarray | None, _: np.ndarray) -> np.ndarray:
+            wanted = y if shape.role == Role.RESIDUAL else y[rows]
+            return np.rint(wanted if means is None else wanted - means / ONE).astype(np.int32)
+
+        self.coded.append(code_group(shape, prior, before, self.known, self.mask, symbols_of))
+        symbols = self.coded[-1].symbols
         slots = scatter_existing(symbols, self.mask) if shape.role == Role.RESIDUAL else symbols
         self.groups.append(Group(shape, prior, slots))
         return len(self.groups) - 1
@@ -174,9 +178,19 @@ class _Chain:
 def _code_references(chain: _Chain, model: TrainedModel, kept: Tensor) -> None:
     entropy, f = model.entropy, _rows(model.references, kept)
     steps, context = (_float32(model.config.entropy.reference_step),), entropy.reference_context
-    sides = (chain.add_side(context, f),) if isinstance(context, Hyperprior) else ()
-    shape = GroupShape(Role.REFERENCE, f.shape[1], steps, sides, sees_coordinates=not sides)
-    chain.add(shape, entropy.reference_network, f)
+    neighbours = entropy.neighbour_network
+    sides: tuple[int, ...] = ()
+    if isinstance(context, Hyperprior) and neighbours is None:
+        sides = (chain.add_side(context, f),)
+    shape = GroupShape(
+        Role.REFERENCE,
+        f.shape[1],
+        steps,
+        sides,
+        sees_coordinates=isinstance(context, NoContext),
+        sees_neighbours=neighbours is not None,
+    )
+    chain.add(shape, neighbours or entropy.reference_network, f)
 
 
 def _code_log_scales(chain: _Chain, model: TrainedModel, kept: Tensor) -> None:
@@ -227,7 +241,12 @@ def integer_network(network: EntropyNetwork, bits: int) -> IntegerNetwork:
                 adds=ends_branch,
             )
         )
-    return IntegerNetwork(tuple(result), skip=last > 0)
+    follow = None
+    if isinstance(network, NeighbourNetwork):
+        shift = weight_exponent(network.follow, bits)
+        whole = _symbols(network.follow.detach().double() * 2.0**shift, (1 << (bits - 1)) - 1)
+        follow = Follow(whole, shift)
+    return IntegerNetwork(tuple(result), skip=last > 0, follow=follow)
 
 
 def quantized_tensor(parameter: Tensor, bits: int) -> QuantizedTensor:

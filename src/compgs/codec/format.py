@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from compgs.errors import CorruptSection, NotACompGSFile, NotEncodable, TruncatedSection, UnsupportedVersion
 
 MAGIC = b"\x93CGS"  # not text, and not valid UTF-8
-VERSION = 2
+VERSION = 3
+OLDEST_VERSION = 2  # that is read; the same without context from neighbours
 OPTIONAL = 0x80  # sections with this bit in their number may be skipped by a decoder that does not know them
 MAX_SECTIONS = 64
 MAX_FILE_BYTES = (1 << 32) - 1
@@ -91,13 +92,18 @@ def container_bytes(sections: int) -> int:
     return _HEADER.size + sections * _ENTRY.size + _CRC.size
 
 
-def pack(sections: list[Section]) -> bytes:
+def pack(sections: list[Section], version: int = VERSION) -> bytes:
     """A file of these sections, in this order."""
     if container_bytes(len(sections)) + sum(len(s.data) for s in sections) > MAX_FILE_BYTES:
         raise NotEncodable(f"the file would exceed {MAX_FILE_BYTES} bytes")
-    head = _HEADER.pack(MAGIC, VERSION, 0, len(sections))
+    head = _HEADER.pack(MAGIC, version, 0, len(sections))
     head += b"".join(_ENTRY.pack(s.number, len(s.data), zlib.crc32(s.data)) for s in sections)
     return b"".join([head, _CRC.pack(zlib.crc32(head)), *(s.data for s in sections)])
+
+
+def version_of(data: bytes) -> int:
+    """Of a file that `unpack` accepts."""
+    return data[len(MAGIC)]
 
 
 def unpack(data: bytes, *, prefix: bool = False) -> list[Section]:
@@ -112,10 +118,10 @@ def unpack(data: bytes, *, prefix: bool = False) -> list[Section]:
     if data[: len(MAGIC)] != MAGIC:
         raise NotACompGSFile("not a .cgs file: it does not begin as one")
     _, version, flags, count = _HEADER.unpack_from(data)
-    if version != VERSION:
+    if not OLDEST_VERSION <= version <= VERSION:
         remedy = "; install a newer compgs" if version > VERSION else "; encode the scene again"
         raise UnsupportedVersion(
-            f"header: the file has version {version}, this decoder reads version {VERSION}{remedy}"
+            f"header: the file has version {version}, this decoder reads versions {OLDEST_VERSION} to {VERSION}{remedy}"
         )
     if len(data) < container_bytes(count):
         raise TruncatedSection(

@@ -25,6 +25,7 @@ SLOPE_BITS = 6  # leaky ReLU of slope 2^-6
 MAX_SHIFT = 30
 BIAS_LIMIT = 1 << 31  # absolute value of a bias
 ACCUMULATOR_LIMIT = 1 << 52
+FOLLOW_LIMIT = 1 << 28
 SCALE_TABLES = 128
 BLOCK_ROWS = 1 << 15  # rows evaluated at a time: memory, not results, depends on it
 TASK_ROWS = 64  # rows that a thread takes at a time
@@ -42,6 +43,20 @@ class IntegerLayer:
 
 
 @dataclass(frozen=True)
+class Follow:
+    """How means follow what neighbours have, channel by channel (docs/bitstream.md, "Neighbours")."""
+
+    weight: np.ndarray  # [C] int32
+    shift: int  # 0 ... 30: weights are in units of 2^-shift
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.shift <= MAX_SHIFT:
+            raise ValueError(f"follow: shift is {self.shift}, expected 0 to {MAX_SHIFT}")
+        if self.weight.ndim != 1 or int(np.abs(self.weight.astype(np.int64)).max(initial=0)) >= FOLLOW_LIMIT:
+            raise ValueError("follow: a weight reaches 2^28")
+
+
+@dataclass(frozen=True)
 class IntegerNetwork:
     """Layers one after the other. Raises ValueError if they do not fit or could leave 53 bits."""
 
@@ -49,6 +64,7 @@ class IntegerNetwork:
     skip: bool = (
         False  # the last of several layers takes the network's inputs behind the activations before it
     )
+    follow: Follow | None = None  # of a group that sees neighbours
 
     def __post_init__(self) -> None:
         if not self.layers:
@@ -78,6 +94,9 @@ class IntegerNetwork:
                 raise ValueError(
                     f"layer {i}: {layer.weight.shape[1]} inputs with weights up to {largest} can exceed 2^52"
                 )
+
+        if self.follow is not None and 2 * len(self.follow.weight) != width:
+            raise ValueError(f"follow: {len(self.follow.weight)} channels, the network has {width // 2}")
 
     @property
     def products(self) -> int:
@@ -129,6 +148,29 @@ def entropy_parameters(
             block, _matrix(last), last.bias, last.shift, last.rectify, mask[part], rows[part], means, index
         )
     return means, index
+
+
+def centre_of(network: IntegerNetwork) -> np.ndarray:
+    """[C] int64, Q12: biases of the last layer's means, around which latents that see neighbours lie in whole steps."""
+    return network.layers[-1].bias[: network.outputs // 2].astype(np.int64)
+
+
+def follow_neighbours(network: IntegerNetwork, around: np.ndarray, means: np.ndarray) -> None:
+    """Move means [N, C] by what neighbours have, [N, C], both int32, Q12: whole steps from the centre."""
+    follow = network.follow
+    assert follow is not None
+    half = 1 << (follow.shift - 1) if follow.shift > 0 else 0
+    _follow(follow.weight.astype(np.int64), half, follow.shift, centre_of(network), around, means)
+
+
+@njit(parallel=True)
+def _follow(weight, half, shift, centre, around, means, share):
+    rounding = 1 << (FRACTION_BITS - 1)
+    for n in portion(len(means), share):
+        for c in range(len(weight)):
+            moved = np.int64(means[n, c]) - centre[c] + ((weight[c] * around[n, c] + half) >> shift)
+            mean = centre[c] + (((moved + rounding) >> FRACTION_BITS) << FRACTION_BITS)
+            means[n, c] = min(max(mean, -ACTIVATION_LIMIT), ACTIVATION_LIMIT - 1)
 
 
 def first_rows(mask: np.ndarray) -> np.ndarray:  # [N + 1] int64

@@ -1,15 +1,14 @@
 """The latents of a range of octree levels, group after group: a pair of encode and decode.
 
 A file has one section of these for each range, coarse to fine, so that its beginning is a coarse scene. Nothing in a
-range depends on another range but, with contexts that see coordinates, on the positions of all anchors.
+range depends on a later one but, with contexts that see coordinates, on the positions of all anchors.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from compgs.codec.anchor_order import MAXIMUM_DEPTH
 from compgs.codec.content import (
     CodedGroup,
     Dimensions,
@@ -24,14 +23,9 @@ from compgs.codec.integer_network import IntegerNetwork
 from compgs.codec.rans import encode_symbols, read_symbols, skip_symbols
 from compgs.codec.tables import HyperTable
 from compgs.errors import CorruptSection
+from compgs.ordering.order import MAXIMUM_DEPTH
 
 Prior = IntegerNetwork | tuple[HyperTable, ...]
-
-# The least anchors of a file for each further range: what a range adds, some thirty bytes, then stays below 1 % of the
-# ten bytes or so of an anchor.
-ANCHORS_PER_RANGE = 350
-MOST_RANGES = 8  # that an encoder makes
-SMALLEST_PART = 32  # the first range has at least this part of the anchors: fewer show nothing
 
 
 @dataclass(frozen=True)
@@ -41,21 +35,6 @@ class RangeHead:
     level: int  # of the octree: the last one of the range
     anchors: int  # of the range
     coupled: int  # coupled primitives of these that exist
-
-
-def chosen_levels(counts: np.ndarray) -> list[int]:
-    """Last level of each range an encoder makes, from `anchor_order.level_counts` [depth + 1]: every range but the
-    first has at least half as many anchors as all before it.
-    """
-    total = int(counts[-1])
-    ends = [len(counts) - 1]
-    most = min(MOST_RANGES, 1 + total // ANCHORS_PER_RANGE)
-    for level in range(len(counts) - 2, -1, -1):
-        if len(ends) == most or SMALLEST_PART * counts[level] < total:
-            break
-        if 3 * counts[level] <= 2 * counts[ends[-1]]:
-            ends.append(level)
-    return ends[::-1]
 
 
 def encode_range(
@@ -83,12 +62,14 @@ def decode_range(
     priors: Sequence[Prior],
     mask: np.ndarray,  # [n, K] bool
     places: np.ndarray,  # [n, 3]
+    around: Callable[[int, IntegerNetwork], np.ndarray],  # [n, 2 + channels] of a group that sees neighbours
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Symbols (int32) and latents (int32, Q12) of each group, [n, channels] or with RESIDUAL [p, channels]."""
     latents: list[np.ndarray] = []
     all_symbols: list[np.ndarray] = []
-    for shape, prior in zip(dimensions.groups, priors, strict=True):
-        means, index, tables = conditional_tables(shape, prior, latents, places, mask)
+    for i, (shape, prior) in enumerate(zip(dimensions.groups, priors, strict=True)):
+        said = around(i, prior) if shape.sees_neighbours and isinstance(prior, IntegerNetwork) else None
+        means, index, tables = conditional_tables(shape, prior, latents, places, mask, said)
         symbols = read_symbols(reader, index.ravel(), tables).reshape(index.shape)
         if symbols.size and (symbols.min() < -MAX_SYMBOL or symbols.max() > MAX_SYMBOL):
             raise CorruptSection(f"{reader.section}: a symbol is not in -{MAX_SYMBOL} to {MAX_SYMBOL}")

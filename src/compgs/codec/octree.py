@@ -11,7 +11,7 @@ a node. Each cell is empty, occupied, or unknown (its parent comes later in the 
 that: bit 16 x + 4 y + z, the node's own children being at 1 and 2 on every axis. Several contexts are made of
 it, and mixed (binary_coder.py).
 
-Nodes are Morton codes of their level (anchor_order.py): the children of node m are 8 m + c, c = 4 x + 2 y +
+Nodes are Morton codes of their level (ordering/order.py): the children of node m are 8 m + c, c = 4 x + 2 y +
 z. Encoder and decoder are one function, so that their contexts cannot drift apart.
 """
 
@@ -21,14 +21,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from compgs.codec.anchor_order import (
-    ALIGNMENT_BITS,
-    MAXIMUM_DEPTH,
-    inv_morton_codes,
-    morton_levels,
-    octree_depth,
-    sorted_morton,
-)
 from compgs.codec.binary_coder import (
     CODER_FIELDS,
     WEIGHT_ONE,
@@ -48,6 +40,14 @@ from compgs.codec.binary_coder import (
 from compgs.codec.fields import FieldReader, signed_varint
 from compgs.errors import CorruptSection, NotEncodable
 from compgs.numerics.compiled import njit
+from compgs.ordering.order import (
+    ALIGNMENT_BITS,
+    MAXIMUM_DEPTH,
+    inv_morton_codes,
+    morton_levels,
+    octree_depth,
+    sorted_morton,
+)
 
 __all__ = ["ANCHORS_PER_BYTE", "MAXIMUM_ANCHORS", "decode_positions", "encode_positions"]
 
@@ -533,7 +533,7 @@ def encode_positions(coordinates: NDArray[np.int32]) -> bytes:
 
 
 def decode_positions(data: bytes, count: int) -> NDArray[np.int32]:
-    """Payload of `count` anchors -> [N, 3] voxel coordinates, in canonical order (anchor_order.py).
+    """Payload of `count` anchors -> [N, 3] voxel coordinates, in canonical order (ordering/order.py).
 
     Inverse of `encode_positions`. Raises CorruptSection for anything that it would not have written, as far
     as that can be told. Takes time and memory in proportion to `count`, which the length of the data bounds.

@@ -6,15 +6,15 @@ from functools import partial
 
 import numpy as np
 
-from compgs.codec.anchor_order import level_counts, represented
 from compgs.codec.content import (
     Dimensions,
     FileContent,
     Group,
     Latents,
     Role,
-    coordinate_context,
+    Surroundings,
     scatter_existing,
+    surroundings,
 )
 from compgs.codec.fields import FieldReader
 from compgs.codec.format import (
@@ -29,13 +29,14 @@ from compgs.codec.format import (
     SCENE,
     SECTION_NAMES,
     TABLES,
-    VERSION,
     VIEWPOINTS,
     Section,
     container_bytes,
     section_ends,
     unpack,
+    version_of,
 )
+from compgs.codec.integer_network import IntegerNetwork
 from compgs.codec.latents import Prior, RangeHead, decode_range, read_head, stream_sizes
 from compgs.codec.limits import HEAD_PRODUCTS, NETWORK_PRODUCTS, SYMBOLS, check_amount, symbols
 from compgs.codec.mask_coder import decode_masks
@@ -46,6 +47,7 @@ from compgs.codec.viewpoints import decode_viewpoints
 from compgs.codec.weights import decode_heads, decode_networks
 from compgs.errors import CorruptSection
 from compgs.numerics.crew import CREW
+from compgs.ordering.order import level_counts, represented
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ def read_latents(
     """
     sections = unpack(data, prefix=prefix)
     by_number = {section.number: section.data for section in sections}
-    scene = decode_scene(by_number[SCENE], SECTION_NAMES[SCENE])
+    scene = decode_scene(by_number[SCENE], SECTION_NAMES[SCENE], version_of(data))
     d = scene.dimensions
     ranges = [section for section in sections if section.number == LATENTS]
     heads_of_ranges = [read_head(FieldReader(r.data, r.name)) for r in ranges]
@@ -152,6 +154,7 @@ def read_latents(
         SECTION_NAMES[NETWORKS],
         d.network_sizes,
         partial(check_products, NETWORK_PRODUCTS, anchors, NETWORKS),
+        d.networks_that_follow,
     )
     coupled = sum(head.coupled for head in heads_of_ranges) if prefix else scene.coupled
     heads = decode_heads(
@@ -170,11 +173,11 @@ def read_latents(
         )
     complete = len(ranges) == sum(number == LATENTS for number, _ in section_ends(data))
     _check_ranges(heads_of_ranges, level_counts(coordinates), mask, whole=complete)
-    places = coordinate_context(coordinates)[:anchors]
+    known = surroundings(coordinates, [head.level for head in heads_of_ranges])
     whole = anchors == scene.anchors
     stands_for = None if whole else represented(coordinates, heads_of_ranges[-1].level)
     coordinates, mask = coordinates[:anchors], mask[:anchors]
-    all_symbols, latents = _decode_ranges(ranges, heads_of_ranges, d, priors, mask, places, keep_symbols)
+    all_symbols, latents = _decode_ranges(ranges, heads_of_ranges, d, priors, mask, known, keep_symbols)
     content = FileContent(
         coupled_primitives=d.coupled_primitives,
         residual_dim=d.residual_dim,
@@ -189,6 +192,7 @@ def read_latents(
         groups=tuple(map(Group, d.groups, priors, all_symbols)),
         heads=heads,
         viewpoints=viewpoints,
+        levels=known.levels if whole else None,
         stands_for=stands_for,
         metadata=metadata,
     )
@@ -236,7 +240,7 @@ def _decode_ranges(
     d: Dimensions,
     priors: list[Prior],
     mask: np.ndarray,
-    places: np.ndarray,
+    known: Surroundings,
     keep_symbols: bool,
 ) -> tuple[list[np.ndarray], Latents]:
     """Symbols of each group as `Group` has them (empty if they are not kept), and latents."""
@@ -248,11 +252,17 @@ def _decode_ranges(
         for n, g in zip(rows, d.groups, strict=True)
     ]
     anchor = primitive = 0
-    for section, head in zip(ranges, heads, strict=True):
+    for number, (section, head) in enumerate(zip(ranges, heads, strict=True)):
         reader = FieldReader(section.data, section.name)
         read_head(reader)
-        part = slice(anchor, anchor + head.anchors)
-        parts = decode_range(reader, d, priors, mask[part], places[part])
+        part = known.rows(number)
+
+        def around(
+            group: int, network: IntegerNetwork, number: int = number, end: int = anchor
+        ) -> np.ndarray:
+            return known.around(number, network, latents[group][:end])
+
+        parts = decode_range(reader, d, priors, mask[part], known.places[part], around)
         for i, shape in enumerate(d.groups):
             to = slice(primitive, primitive + head.coupled) if shape.role == Role.RESIDUAL else part
             latents[i][to] = parts[1][i]
@@ -270,7 +280,7 @@ def file_info(data: bytes) -> FileInfo:
     """Bytes and bits by section and group; verifies the checksums, decodes the scene section and the ranges' heads."""
     sections = unpack(data)
     by_number = {section.number: section.data for section in sections}
-    scene = decode_scene(by_number[SCENE], SECTION_NAMES[SCENE])
+    scene = decode_scene(by_number[SCENE], SECTION_NAMES[SCENE], version_of(data))
     check_amount(SYMBOLS, symbols(scene.dimensions, scene.anchors), len(data), SECTION_NAMES[SCENE])
     metadata = decode_metadata(by_number[METADATA], SECTION_NAMES[METADATA]) if METADATA in by_number else {}
     names = group_names(scene.dimensions)
@@ -290,7 +300,7 @@ def file_info(data: bytes) -> FileInfo:
         ranges.append(RangeInfo(head.level, anchors, at))
     sizes += [*zip(names, streams, strict=True), ("container", container_bytes(len(sections)) + heads)]
     return FileInfo(
-        version=VERSION,
+        version=version_of(data),
         bytes=len(data),
         anchors=scene.anchors,
         coupled=scene.coupled,

@@ -1,11 +1,13 @@
 """A smaller file from a file, without training: fewer coupled primitives, coarser covariances.
 
 Both work on what the file holds and leave alone what other symbols are conditioned on: references and hyperpriors keep
-their symbols, so that everything that is kept decodes to what it was. Residual embeddings keep their step: most of
-their symbols are 0, 1 or -1, and a coarser step either leaves those where they are or loses them all
-(measured in docs/log/2026-11-21-sizes.md).
+their symbols, so that everything that is kept decodes to what it was. Only where anchors see neighbours, and some of
+these go, are there other symbols for the same. Residual embeddings keep their step: most
+of their symbols are 0, 1 or -1, and a coarser step either leaves those where they are or loses them all (measured in
+docs/log/2026-11-21-sizes.md).
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,13 +17,17 @@ from compgs.codec.content import (
     FileContent,
     Group,
     Role,
+    SymbolsOf,
+    code_group,
     conditional_tables,
-    coordinate_context,
     dequantize,
+    reordered,
+    surroundings,
 )
 from compgs.codec.integer_network import BIAS_LIMIT, FRACTION_BITS, IntegerNetwork
 from compgs.codec.tables import SCALES_PER_OCTAVE
 from compgs.errors import NotEncodable
+from compgs.ordering.order import canonical_order
 
 
 def without_coupled(content: FileContent, kept: np.ndarray) -> FileContent:
@@ -36,12 +42,43 @@ def without_coupled(content: FileContent, kept: np.ndarray) -> FileContent:
             symbols = symbols * mask[:, :, None]
         return replace(group, symbols=symbols[anchors])
 
-    return replace(
+    smaller = replace(
         content,
         coordinates=content.coordinates[anchors],
         mask=mask[anchors],
         groups=tuple(map(narrowed, content.groups)),
+        levels=None,  # the octree may be another one
     )
+    if not any(group.shape.sees_neighbours for group in content.groups):
+        return smaller
+    order = canonical_order(smaller.coordinates)
+    latents = [
+        x if group.shape.role == Role.RESIDUAL else x[anchors][order]
+        for group, x in zip(content.groups, dequantize(content), strict=True)
+    ]
+    return _around_others(reordered(smaller, order), latents)
+
+
+def _around_others(content: FileContent, latents: Sequence[np.ndarray]) -> FileContent:
+    """The content, in canonical order, with the symbols that have these latents (Q12; of RESIDUAL groups any) though
+    other neighbours are there. They exist: latents lie whole steps from what neighbours cannot change.
+    """
+    known = surroundings(content.coordinates, content.levels)
+    groups = list(content.groups)
+    for i, group in enumerate(groups):
+        if group.shape.sees_neighbours:
+            before, symbols_of = latents[:i], _symbols_of(latents[i])
+            coded = code_group(group.shape, group.prior, before, known, content.mask, symbols_of)
+            groups[i] = replace(group, symbols=coded.symbols)
+    return replace(content, groups=tuple(groups))
+
+
+def _symbols_of(latents: np.ndarray) -> SymbolsOf:
+    def symbols_of(rows: slice, means: np.ndarray | None, _: np.ndarray) -> np.ndarray:
+        assert means is not None
+        return (latents[rows] - means) >> FRACTION_BITS
+
+    return symbols_of
 
 
 def with_coarser_covariances(content: FileContent, ratio: float) -> FileContent:
@@ -53,7 +90,7 @@ def with_coarser_covariances(content: FileContent, ratio: float) -> FileContent:
     """
     index = next(i for i, g in enumerate(content.groups) if g.shape.role == Role.LOG_SCALES)
     group = content.groups[index]
-    taken = any(index in other.shape.context for other in content.groups)
+    taken = group.shape.sees_neighbours or any(index in other.shape.context for other in content.groups)
     if taken or group.shape.channels < LOG_SCALES or not isinstance(group.prior, IntegerNetwork):
         raise NotEncodable("log scales: other latents depend on them; coarser ones need another training")
     steps = tuple(float(np.float32(step * ratio)) for step in group.shape.steps)
@@ -62,7 +99,7 @@ def with_coarser_covariances(content: FileContent, ratio: float) -> FileContent:
     network = rescaled(group.prior, ratios)
     shape = replace(group.shape, steps=steps)
     coded = replace(group, shape=shape, prior=network)
-    places = coordinate_context(content.coordinates)
+    places = surroundings(content.coordinates).places
     means, _, _ = conditional_tables(shape, network, latents, places, content.mask)
     symbols = np.rint((latents[index] / ratios - means) / (1 << FRACTION_BITS)).astype(np.int32)
     groups = list(content.groups)

@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import starmap
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,8 @@ from compgs.codec.format import (
     MAX_RESIDUAL_DIM,
     MAX_SIDE_DIM,
     MAX_WIDTH,
+    OLDEST_VERSION,
+    VERSION,
 )
 from compgs.codec.tables import LEVELS, MAX_HYPER_SYMBOLS, MAX_LOWEST, MAX_TABLES, HyperTable
 from compgs.codec.weights import decode_arrays, encode_arrays
@@ -31,7 +34,7 @@ SCENE_LAYOUT = "<II BBBH ddddd fff"
 # Of the floating-point numbers: none may be zero, subnormal or infinite as a 32-bit number, nor its product
 # with a latent.
 SMALLEST, LARGEST = 2.0**-64, 2.0**64
-SEES_COORDINATES = 1  # bit of a group's context; bit i + 1 is group i
+SEES_COORDINATES = 1  # bit of a group's context; bit i + 1 is group i, of itself what neighbours have
 
 CHANNEL_LIMITS = {
     Role.SIDE: MAX_SIDE_DIM,
@@ -69,16 +72,22 @@ def encode_scene(content: FileContent) -> bytes:
         content.view_distance_scale,
         *content.background,
     )
-    return fields + bytes([len(d.groups)]) + b"".join(_encode_group(group) for group in d.groups)
+    return fields + bytes([len(d.groups)]) + b"".join(starmap(_encode_group, enumerate(d.groups)))
 
 
-def _encode_group(shape: GroupShape) -> bytes:
-    context = SEES_COORDINATES * shape.sees_coordinates + sum(2 << i for i in shape.context)
+def least_version(d: Dimensions) -> int:
+    """Of the format, for such groups."""
+    return VERSION if any(group.sees_neighbours for group in d.groups) else OLDEST_VERSION
+
+
+def _encode_group(index: int, shape: GroupShape) -> bytes:
+    taken = (*shape.context, index) if shape.sees_neighbours else shape.context
+    context = SEES_COORDINATES * shape.sees_coordinates + sum(2 << i for i in taken)
     steps = struct.pack(f"<{len(shape.steps)}f", *shape.steps)
     return bytes([shape.role]) + varint(shape.channels) + varint(context) + varint(len(shape.steps)) + steps
 
 
-def decode_scene(data: bytes, section: str) -> SceneSection:
+def decode_scene(data: bytes, section: str, version: int = VERSION) -> SceneSection:
     reader = FieldReader(data, section)
     anchors, coupled, k, residual_dim, heads, width, *numbers = reader.struct(SCENE_LAYOUT, "fields")
     if not 1 <= anchors <= MAX_ANCHORS:
@@ -88,7 +97,7 @@ def decode_scene(data: bytes, section: str) -> SceneSection:
     if heads >= len(HEADS):
         raise CorruptSection(f"{section}: heads are {heads}, expected 0 to {len(HEADS) - 1}")
     count = reader.varint("groups", 1, MAX_GROUPS)
-    groups = tuple(_decode_group(reader, i) for i in range(count))
+    groups = tuple(_decode_group(reader, i, version) for i in range(count))
     reader.end()
     d = Dimensions(k, residual_dim, HEADS[heads], width, groups)
     voxel, x, y, z, distance, *background = numbers
@@ -101,14 +110,16 @@ def decode_scene(data: bytes, section: str) -> SceneSection:
     return scene
 
 
-def _decode_group(reader: FieldReader, index: int) -> GroupShape:
+def _decode_group(reader: FieldReader, index: int, version: int) -> GroupShape:
     role = Role(reader.varint(f"role of group {index}", 0, max(Role)))
     channels = reader.varint(f"channels of group {index}", 1, CHANNEL_LIMITS[role])
-    context = reader.varint(f"context of group {index}", 0, (2 << index) - 1)
+    most = (4 if version > OLDEST_VERSION else 2) << index
+    context = reader.varint(f"context of group {index}", 0, most - 1)
     count = reader.varint(f"steps of group {index}", 0, channels)
     steps = reader.struct(f"<{count}f", f"steps of group {index}")
     inputs = tuple(i for i in range(index) if context >> (i + 1) & 1)
-    return GroupShape(role, channels, steps, inputs, bool(context & SEES_COORDINATES))
+    neighbours = bool(context >> (index + 1) & 1)
+    return GroupShape(role, channels, steps, inputs, bool(context & SEES_COORDINATES), neighbours)
 
 
 def wrong_dimension(d: Dimensions) -> str:
@@ -132,6 +143,8 @@ def wrong_dimension(d: Dimensions) -> str:
             return f"a step of group {i} is not in {SMALLEST:.3g} to {LARGEST:.3g}"
         if any(d.groups[j].role == Role.RESIDUAL for j in group.context):
             return f"group {i} takes latents of coupled primitives, which no other group may"
+        if group.sees_neighbours and group.role == Role.RESIDUAL:
+            return f"group {i} takes what neighbours have of coupled primitives, which no group may"
         if not group.has_network and group.width(d.coupled_primitives) > MAX_TABLES:
             return f"group {i} has {group.width(d.coupled_primitives)} tables, expected at most {MAX_TABLES}"
     if not 1 <= d.channels(Role.REFERENCE) <= MAX_REFERENCE_DIM:

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compgs.codec.anchor_order import canonical_order
 from compgs.codec.octree import MAXIMUM_ANCHORS
 from compgs.errors import CorruptSection, MissingDependency, NotEncodable
+from compgs.ordering.order import canonical_order
 
 __all__ = ["ASKED_BY", "PROGRAM", "decode_positions_tmc3", "encode_positions_tmc3", "find_program"]
 
@@ -81,7 +81,7 @@ def encode_positions_tmc3(coordinates: NDArray[np.int32]) -> bytes:
 
 
 def decode_positions_tmc3(data: bytes, count: int) -> NDArray[np.int32]:
-    """Payload of `count` anchors -> [N, 3] voxel coordinates, in canonical order (anchor_order.py).
+    """Payload of `count` anchors -> [N, 3] voxel coordinates, in canonical order (ordering/order.py).
 
     TMC13 returns its points in an order of its own. Raises MissingDependency without `tmc3`, or where nobody asked for
     it, CorruptSection if what it decodes is not `count` distinct voxels. How `tmc3` behaves on damaged data is beyond

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compgs.codec.fields import FieldReader, signed_varint, varint
-from compgs.codec.integer_network import MAX_SHIFT, IntegerLayer, IntegerNetwork
+from compgs.codec.integer_network import MAX_SHIFT, Follow, IntegerLayer, IntegerNetwork
 from compgs.codec.rans import decode_symbols, encode_symbols
 from compgs.codec.tables import GAUSSIAN_COUNT, SCALES_PER_OCTAVE, SMALLEST_SCALE_OCTAVE, gaussian_tables
 from compgs.errors import CorruptSection, NotEncodable
@@ -100,6 +100,9 @@ def encode_networks(networks: Sequence[IntegerNetwork]) -> bytes:
             flags = layer.shift | ADDS * layer.adds | RECTIFY * layer.rectify
             fields.append(varint(len(layer.bias)) + bytes([flags]))
             arrays += np.array_split(layer.weight, 2) + np.array_split(layer.bias, 2)
+        if network.follow is not None:
+            fields.append(bytes([network.follow.shift]))
+            arrays.append(network.follow.weight)
     _check_count("entropy networks", arrays)
     return b"".join(fields) + (encode_arrays(arrays) if arrays else b"")
 
@@ -109,12 +112,15 @@ def decode_networks(
     section: str,
     sizes: Sequence[tuple[int, int]],
     check_products: Callable[[int], None] = lambda products: None,
+    follows: Sequence[bool] | None = None,
 ) -> list[IntegerNetwork]:
-    """Inverse of `encode_networks`, given (inputs, outputs) of each network. `check_products` may refuse the number of
-    weights before any is decoded.
+    """Inverse of `encode_networks`, given (inputs, outputs) of each network, and which of their groups see neighbours
+    (None: none does). `check_products` may refuse the number of weights before any is decoded.
     """
     reader = FieldReader(data, section)
     plan: list[list[int]] = []  # of each network: flags of its layers
+    follows = [False] * len(sizes) if follows is None else follows
+    follow_shifts: list[int | None] = []
     skips = []
     shapes: list[tuple[int, ...]] = []
     for n, (inputs, outputs) in enumerate(sizes):
@@ -144,6 +150,10 @@ def decode_networks(
         if widths[-1] != outputs:
             raise CorruptSection(f"{section}: network {n} has {widths[-1]} outputs, expected {outputs}")
         skips.append(bool(skip))
+        follow_shifts.append(None)
+        if follows[n]:
+            follow_shifts[-1] = reader.bytes(1, f"follow shift of network {n}")[0]
+            shapes.append((outputs // 2,))
     _check_sizes(section, shapes)
     check_products(sum(shape[0] * shape[1] for shape in shapes if len(shape) == 2))
     if not sizes:
@@ -151,7 +161,7 @@ def decode_networks(
         return []
     arrays = iter(decode_arrays(reader, shapes))
     networks = []
-    for flags_of_layers, with_skip in zip(plan, skips, strict=True):
+    for flags_of_layers, with_skip, follow_shift in zip(plan, skips, follow_shifts, strict=True):
         layers = []
         for flags in flags_of_layers:
             weight = np.concatenate([next(arrays), next(arrays)])
@@ -160,7 +170,8 @@ def decode_networks(
                 IntegerLayer(weight, bias, flags & SHIFTS, bool(flags & RECTIFY), bool(flags & ADDS))
             )
         try:
-            networks.append(IntegerNetwork(tuple(layers), with_skip))
+            follow = None if follow_shift is None else Follow(next(arrays), follow_shift)
+            networks.append(IntegerNetwork(tuple(layers), with_skip, follow))
         except ValueError as error:
             raise CorruptSection(f"{section}: {error}") from error
     return networks

@@ -1,13 +1,20 @@
 """Integers become bytes: the mirror image of reader.py, section by section."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from compgs.codec.anchor_order import canonical_order, level_counts
-from compgs.codec.content import CodedGroup, FileContent, Group, Role, coordinate_context, walk
+from compgs.codec.content import (
+    CodedGroup,
+    FileContent,
+    Group,
+    Role,
+    Surroundings,
+    reordered,
+    surroundings,
+    walk,
+)
 from compgs.codec.fields import FieldReader
 from compgs.codec.format import (
     HEADS,
@@ -30,7 +37,7 @@ from compgs.codec.format import (
     pack,
 )
 from compgs.codec.integer_network import IntegerNetwork, first_rows
-from compgs.codec.latents import chosen_levels, encode_range, read_head
+from compgs.codec.latents import encode_range, read_head
 from compgs.codec.limits import least_bytes
 from compgs.codec.mask_coder import encode_masks
 from compgs.codec.octree import encode_positions
@@ -41,6 +48,7 @@ from compgs.codec.sections import (
     encode_metadata,
     encode_scene,
     encode_tables,
+    least_version,
     wrong_dimension,
     wrong_number,
 )
@@ -49,6 +57,7 @@ from compgs.codec.tmc3 import encode_positions_tmc3
 from compgs.codec.viewpoints import encode_viewpoints
 from compgs.codec.weights import encode_heads, encode_networks
 from compgs.errors import NotEncodable
+from compgs.ordering.order import canonical_order
 
 Geometry = Literal["octree", "tmc3"]
 
@@ -63,18 +72,18 @@ def write_content(
     """The bytes of a .cgs file. Anchors may come in any order; the file has them in the canonical one.
 
     `geometry`: positions by the octree coder, or as in the paper by G-PCC, whose program `tmc3` writer and reader then
-    need. `levels`: last octree level of each range of latents, ascending, the last one the octree's depth; chosen by
-    the number of anchors if not given. Symbols of coupled primitives that do not exist are ignored. `coded`: what a
+    need. `levels`: last octree level of each range of latents, ascending, the last one the octree's depth; those of the
+    content if not given. Symbols of coupled primitives that do not exist are ignored. `coded`: what a
     `content.walk` along the groups gives, if that is known and the anchors are in canonical order; networks are then
     not evaluated again.
 
     Raises MissingDependency without that program, NotEncodable if the format cannot represent the content.
     """
     check_content(content)
-    ordered = _reordered(content, canonical_order(content.coordinates))
+    ordered = reordered(content, canonical_order(content.coordinates))
     assert coded is None or ordered is content, "coded groups in another order than the file's"
     content = ordered
-    counts = level_counts(content.coordinates)
+    known = surroundings(content.coordinates, content.levels if levels is None else levels)
     networks = [g.prior for g in content.groups if isinstance(g.prior, IntegerNetwork)]
     tables = [table for g in content.groups if not isinstance(g.prior, IntegerNetwork) for table in g.prior]
     sections = [Section(SCENE, encode_scene(content))]
@@ -87,13 +96,13 @@ def write_content(
         Section(NETWORKS, encode_networks(networks)),
         Section(HEADS, encode_heads(content.heads)),
     ]
-    ranges = _ranges(content, counts, chosen_levels(counts) if levels is None else levels, coded)
+    ranges = _ranges(content, known, coded)
     padding = _padding(content, sections, ranges)
     if padding:  # before the ranges, so that the beginnings of the file that are scenes are padded, too
         sections.append(Section(PADDING, bytes(padding)))
     if content.metadata:
         ranges.append(Section(METADATA, encode_metadata(content.metadata)))
-    return pack(sections + ranges)
+    return pack(sections + ranges, least_version(content.dimensions))
 
 
 def _positions(coordinates: np.ndarray, geometry: Geometry) -> Section:
@@ -102,22 +111,15 @@ def _positions(coordinates: np.ndarray, geometry: Geometry) -> Section:
     return Section(POSITIONS_GPCC, encode_positions_tmc3(coordinates))
 
 
-def _ranges(
-    content: FileContent, counts: np.ndarray, levels: list[int], coded: Sequence[CodedGroup] | None
-) -> list[Section]:
-    ends = [int(counts[level]) for level in levels]
-    assert levels[-1] == len(counts) - 1 and ends == sorted(set(ends)) and len(levels) <= MAX_RANGES, levels
-    places = coordinate_context(content.coordinates)
+def _ranges(content: FileContent, known: Surroundings, coded: Sequence[CodedGroup] | None) -> list[Section]:
+    levels, ends = known.levels, known.ends
+    assert levels[-1] == known.depth and list(ends) == sorted(set(ends)) and len(levels) <= MAX_RANGES, levels
+    coded = list(walk(content.groups, content.mask, known)) if coded is None else coded
     sections = []
-    for level, start, end in zip(levels, [0, *ends], ends, strict=False):
-        rows = slice(start, end)
-        mask = content.mask[rows]
-        if coded is None:
-            groups = [replace(group, symbols=group.symbols[rows]) for group in content.groups]
-            chain = walk(groups, mask, places[rows])
-        else:
-            chain = _of_rows(content, coded, rows)
-        sections.append(Section(LATENTS, encode_range(level, mask, chain)))
+    for number, level in enumerate(levels):
+        rows = known.rows(number)
+        chain = _of_rows(content, coded, rows)
+        sections.append(Section(LATENTS, encode_range(level, content.mask[rows], chain)))
     return sections
 
 
@@ -169,6 +171,10 @@ def _check_group(index: int, group: Group, content: FileContent) -> None:
     if isinstance(group.prior, IntegerNetwork) != shape.has_network:
         raise NotEncodable(f"{name}: expected a network where there is context, else tables")
     if isinstance(group.prior, IntegerNetwork):
+        if (group.prior.follow is not None) != shape.sees_neighbours:
+            raise NotEncodable(
+                f"{name}: expected a network that follows neighbours where the group sees them"
+            )
         found = group.prior.inputs, group.prior.outputs
         if found != d.network_size(shape):
             raise NotEncodable(
@@ -186,17 +192,6 @@ def _check_group(index: int, group: Group, content: FileContent) -> None:
             )
         if table.levels.min() < 0 or table.levels.max() >= LEVELS:
             raise NotEncodable(f"{name}: table {i} has a level outside 0 to {LEVELS - 1}")
-
-
-def _reordered(content: FileContent, order: np.ndarray) -> FileContent:
-    if (order[1:] > order[:-1]).all():
-        return content
-    return replace(
-        content,
-        coordinates=content.coordinates[order],
-        mask=content.mask[order],
-        groups=tuple(replace(group, symbols=group.symbols[order]) for group in content.groups),
-    )
 
 
 def _padding(content: FileContent, before: list[Section], ranges: list[Section]) -> int:

@@ -8,6 +8,7 @@ primitives, flattened; `z` hyperpriors. All latents are in units of their quanti
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,6 +17,8 @@ from torch import Tensor, nn
 from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy.conditional import code_latents
 from compgs.entropy.contexts import Hyperprior, NoContext
+from compgs.entropy.neighbour_network import NeighbourNetwork
+from compgs.entropy.neighbourhood import BESIDES
 from compgs.entropy.network import EntropyNetwork
 from compgs.tensors.linear import Reader
 
@@ -36,7 +39,18 @@ class Quantized:
     references: Tensor  # [N, reference_dim]
     covariances: Tensor  # [N, 6]
     residuals: Tensor  # [N, K * residual_dim]
-    bits: dict[str, Tensor]  # stream -> [N] bits per anchor; empty when not asked for
+    bits: dict[str, Tensor]  # stream -> [N] bits per anchor, as training pays for; empty when not asked for
+    neighbour_bits: Tensor | None = (
+        None  # [N] of the references in the file, if they are coded around neighbours
+    )
+
+    @property
+    def bits_in_file(self) -> dict[str, Tensor]:
+        """Bits [N] of the streams that the file has."""
+        if self.neighbour_bits is None:
+            return self.bits
+        others = {name: b for name, b in self.bits.items() if name not in ("reference_hyper", "reference")}
+        return {"reference": self.neighbour_bits, **others}
 
     def latents(self) -> tuple[Tensor, Tensor, Tensor]:
         """References, covariances and residuals."""
@@ -53,13 +67,14 @@ class Quantized:
             return self
         references, covariances, residuals = (latent.index_select(0, part) for latent in self.latents())
         bits = {name: of_stream.index_select(0, part) for name, of_stream in self.bits.items()}
-        return Quantized(references, covariances, residuals, bits)
+        beside = None if self.neighbour_bits is None else self.neighbour_bits.index_select(0, part)
+        return Quantized(references, covariances, residuals, bits, beside)
 
 
 class EntropyModel(nn.Module):
-    """The references as context for everything else; a hyperprior for them, or none (CompGS Sec. 3.3).
+    """The references as context for everything else; neighbours or a hyperprior for them, or none (CompGS Sec. 3.3).
 
-    f ──analysis──► z_f ──► (mean, scale) of f
+    f ──analysis──► z_f ──► (mean, scale) of f        or        f_hat of neighbours ──► (mean, scale) of f
     f_hat ──► (mean, scale) of c
 
     Residual embeddings, which here all anchors share, pass through: the file holds them beside the heads.
@@ -70,15 +85,17 @@ class EntropyModel(nn.Module):
         self.slots = model.coupled_primitives
         self.residual_channels = model.coupled_primitives * model.residual_dim
         shape = entropy.network_blocks, entropy.network_width
-        hyper = entropy.reference_hyper_dim if model.hyperprior else 0
-        self.reference_context: Hyperprior | NoContext = (
-            Hyperprior("reference_hyper", model.reference_dim, hyper) if hyper else NoContext()
-        )
-        self.reference_network = EntropyNetwork(
-            self.reference_context.outputs, model.reference_dim, *(shape if hyper else ())
-        )
-        if not hyper:
+        self.reference_context: Hyperprior | NoContext
+        if model.reference_context == "none":
+            self.reference_context = NoContext()
+            self.reference_network = EntropyNetwork(NoContext.outputs, model.reference_dim)
             self.reference_network.make_constant()
+        else:
+            hyper = entropy.reference_hyper_dim
+            self.reference_context = Hyperprior("reference_hyper", model.reference_dim, hyper)
+            self.reference_network = EntropyNetwork(hyper, model.reference_dim, *shape)
+        follows = model.reference_context == "neighbours"
+        self.neighbour_network = NeighbourNetwork(model.reference_dim) if follows else None
         # Log scales span a few natural units, that is dozens of steps.
         self.covariance_network = EntropyNetwork(
             model.reference_dim, 6, *shape, mean_gain=1.0 / entropy.covariance_step
@@ -86,9 +103,11 @@ class EntropyModel(nn.Module):
         self.log_covariance_step = nn.Parameter(torch.full((6,), entropy.covariance_step).log())
 
     @property
-    def has_hyperprior(self) -> bool:
-        """Of the references."""
-        return isinstance(self.reference_context, Hyperprior)
+    def context_of_references(self) -> Literal["neighbours", "hyperprior", "none"]:
+        """In the file, before they are decoded."""
+        if self.neighbour_network is not None:
+            return "neighbours"
+        return "hyperprior" if isinstance(self.reference_context, Hyperprior) else "none"
 
     @property
     def covariance_step(self) -> Tensor:
@@ -98,7 +117,13 @@ class EntropyModel(nn.Module):
     @property
     def coded_networks(self) -> tuple[EntropyNetwork, ...]:
         """The networks that the decoder needs, and so the file holds."""
-        return self.reference_network, self.covariance_network
+        return self.neighbour_network or self.reference_network, self.covariance_network
+
+    @property
+    def reference_networks(self) -> tuple[EntropyNetwork, ...]:
+        """All that say what to expect of the references."""
+        own = self.reference_network
+        return (own,) if self.neighbour_network is None else (own, self.neighbour_network)
 
     @property
     def channels(self) -> dict[str, int]:
@@ -133,20 +158,25 @@ class EntropyModel(nn.Module):
         return torch.empty(self.residual_channels).uniform_(-SLOT_SPREAD, SLOT_SPREAD)
 
     @torch.no_grad()
-    def restart_reference_scales(self, references: Tensor) -> tuple[nn.Parameter, nn.Parameter]:
-        """Scales of the references as they are now, [N, reference_dim], whatever the hyperprior says of them, and
-        without one their means; the two parameters whose second halves the scales are.
+    def restart_reference_scales(
+        self, references: Tensor, around: Callable[[], Tensor | None] = lambda: None
+    ) -> list[nn.Parameter]:
+        """Scales of the references as they are now, [N, reference_dim], whatever the hyperprior or neighbours say of
+        them, and without a hyperprior their means; the parameters whose second halves the scales are. `around`: what
+        neighbours have by then (`forward`).
         """
-        network, context = self.reference_network, self.reference_context
-        weight, bias = network.weights[-1], network.biases[-1]
-        # numpy's sums do not depend on the number of threads
+        network, context, neighbours = self.reference_network, self.reference_context, self.neighbour_network
         if isinstance(context, NoContext):
-            bias[: network.channels] = torch.from_numpy(references.double().cpu().numpy().mean(0))
+            _start_means(network, references)
         mean, _ = network(context.decoded(context(references)))
-        spread = (references - mean).double().cpu().numpy().std(0)
-        weight[network.channels :] = 0
-        bias[network.channels :] = torch.from_numpy(np.log2(np.maximum(spread, SMALLEST_SPREAD)))
-        return weight, bias
+        restarted = _start_scales(network, references - mean)
+        if neighbours is not None:
+            _start_means(neighbours, references)
+            known = around()
+            assert known is not None
+            deviations = references - neighbours.centre - neighbours.moved(known)
+            restarted += _start_scales(neighbours, deviations, known[:, :BESIDES])
+        return restarted
 
     def forward(
         self,
@@ -158,23 +188,31 @@ class EntropyModel(nn.Module):
         noise: Callable[[Tensor], Tensor] | None = None,
         network_bits: int | None = None,
         mask: Tensor | None = None,  # [N, K] bool: coupled primitives that are coded; default all
+        around: Tensor
+        | None = None,  # [N, 2 + reference_dim] `Neighbourhood.around`, if references see neighbours
     ) -> Quantized:
         """Quantize, and estimate the bits if `rate`.
 
         With `noise` the likelihood sees uniform noise (training), without it the symbols themselves (the size of the
-        file). `network_bits`: the networks' weights as the file will hold them.
+        file). `network_bits`: the networks' weights as the file will hold them. Where references see neighbours, the
+        rate that leads them is that of the hyperprior; the network of the neighbours learns beside it.
         """
-        known = self.reference_context(references)
+        z = self.reference_context(references)
         code = partial(code_latents, rate=rate, noise=noise, network_bits=network_bits)
-        f_hat, bits_f = code(references, self.reference_context.decoded(known), self.reference_network)
+        f_hat, bits_f = code(references, self.reference_context.decoded(z), self.reference_network)
+        neighbours, bits_n = self.neighbour_network, None
+        if neighbours is not None:
+            f_hat, bits_n = neighbours.code(
+                references, around, code, rate=rate, noise=noise, bits=network_bits
+            )
         c_hat, bits_c = code(covariances, f_hat, self.covariance_network)
         bits = {
-            **(self.reference_context.bits(known, noise) if rate else {}),
+            **(self.reference_context.bits(z, noise) if rate else {}),
             "reference": bits_f,
             "covariance": bits_c,
         }
         g_hat, bits_g = self.code_residuals(residuals, f_hat, code, rate=rate, noise=noise, mask=mask)
-        return Quantized(f_hat, c_hat, g_hat, {**bits, **bits_g} if rate else {})
+        return Quantized(f_hat, c_hat, g_hat, {**bits, **bits_g} if rate else {}, bits_n)
 
     def code_residuals(
         self,
@@ -242,6 +280,31 @@ class OwnResidualsEntropyModel(EntropyModel):
         g_hat, bits_g = code(residuals, context, self.residual_network, mask=mask)
         hyper = self.residual_hyperprior.bits(z_g, noise) if rate else {}
         return g_hat, {**hyper, "residual": bits_g}
+
+
+def _start_means(network: EntropyNetwork, references: Tensor) -> None:
+    # numpy's sums do not depend on the number of threads
+    means = torch.from_numpy(references.double().cpu().numpy().mean(0))
+    network.biases[-1][: network.channels] = means.to(network.biases[-1])
+
+
+def _start_scales(
+    network: EntropyNetwork, deviations: Tensor, known: Tensor | None = None
+) -> list[nn.Parameter]:
+    """The parameters whose second halves they are. What is `known` [N, inputs] goes on to say of all channels alike
+    what it said on average; None: nothing.
+    """
+    weight, bias = network.weights[-1], network.biases[-1]
+    spread = np.maximum(deviations.double().cpu().numpy().std(0), SMALLEST_SPREAD)
+    scales = weight[network.channels :]
+    scales[:] = 0 if known is None else scales.mean(0)
+    said = (
+        0.0
+        if known is None
+        else float(scales[0].double().cpu().numpy() @ known.double().cpu().numpy().mean(0))
+    )
+    bias[network.channels :] = torch.from_numpy(np.log2(spread) - said)
+    return [weight, bias]
 
 
 Coder = Callable[..., tuple[Tensor, Tensor]]  # `code_latents` with what a whole step has in common

@@ -32,12 +32,17 @@ class _RoundHalfUp(torch.autograd.Function):
         return grads[0]
 
 
+def round_half_up(x: Tensor) -> Tensor:
+    """The nearest whole number, straight-through; of two the larger, as in the decoder."""
+    rounded: Tensor = _RoundHalfUp.apply(x)
+    return rounded
+
+
 def round_fixed(x: Tensor) -> Tensor:
     """The nearest number that the decoder's fixed point can hold, straight-through; of two the larger, as there: few
     weights have so many digits that none of their sums lies half-way.
     """
-    rounded: Tensor = _RoundHalfUp.apply(x * 2.0**FRACTION_BITS)
-    return rounded * 2.0**-FRACTION_BITS
+    return round_half_up(x * 2.0**FRACTION_BITS) * 2.0**-FRACTION_BITS
 
 
 class EntropyNetwork(nn.Module):
@@ -82,6 +87,11 @@ class EntropyNetwork(nn.Module):
         """Means and scales that depend on nothing: of a single layer, biases are all that is learned."""
         assert not self.blocks
         nn.init.zeros_(self.weights[0].requires_grad_(False))
+
+    @property
+    def per_channel(self) -> tuple[nn.Parameter, ...]:
+        """Parameters [C] beside the last layer's rows."""
+        return ()
 
     def readers(self, first: int) -> Iterator[Reader]:
         """The layers that take the input; what is meant begins at its channel `first`."""

@@ -36,7 +36,7 @@ from compgs.training.restoring import (
 )
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
-CHECKPOINT_VERSION = "6"
+CHECKPOINT_VERSION = "7"
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, writer: Writer | None = 
                 "width": model.dimensions.width,
                 "residuals": model.own_residuals,
                 "heads": model.dimensions.heads,
-                "hyperprior": model.entropy.has_hyperprior,
+                "reference_context": model.entropy.context_of_references,
                 "head_bits": model.head_bits,
             }
         ),
@@ -180,11 +180,11 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     red, green, blue = finite(scene["background"], 3, "background")
     x, y, z = finite(scene["world_offset"], 3, "world_offset")
     width = whole_number(scene["width"], 1, config.model.width, "width")
-    flags = {name: scene[name] for name in ("residuals", "hyperprior")}
-    for name, value in flags.items():
-        if not isinstance(value, bool):
-            raise ValueError(f"{name}: expected true or false, found {value!r}")
-    layout = scene["heads"]
+    residuals, context, layout = scene["residuals"], scene["reference_context"], scene["heads"]
+    if not isinstance(residuals, bool):
+        raise ValueError(f"residuals: expected true or false, found {residuals!r}")
+    if context not in ("neighbours", "hyperprior", "none"):
+        raise ValueError(f"reference_context: expected neighbours, hyperprior or none, found {context!r}")
     if layout not in ("separate", "paired"):
         raise ValueError(f"heads: expected separate or paired, found {layout!r}")
     made = replace(
@@ -193,7 +193,8 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
         reference_dim=references.shape[1],
         width=width,
         heads=layout,
-        **flags,
+        residuals=residuals,
+        reference_context=context,
     )
     model = TrainedModel(
         config,

@@ -69,7 +69,7 @@ def decorrelate(model: TrainedModel, optimizer: torch.optim.Optimizer) -> None:
             _turn(state["exp_avg"], dimension, first, axes)
             # As if gradients of different channels had nothing in common: more than the squares is not known.
             _turn(state["exp_avg_sq"], dimension, first, axes.square())
-    for parameter in model.entropy.restart_reference_scales(model.references):
+    for parameter in model.entropy.restart_reference_scales(model.references, model.around):
         state = optimizer.state.get(parameter, {})
         if "exp_avg" in state:
             state["exp_avg"][model.reference_dim :] = 0
@@ -97,18 +97,17 @@ def keep_channels(
     optimizer: torch.optim.Optimizer | None = None,
 ) -> None:
     """The same model without the other channels of its references, and Adam's moments without them."""
-    network = model.entropy.reference_network
     both = kept.repeat(2)  # means and scales
-    changes = [
-        (model.references, 1, 0, kept),
-        (network.weights[-1], 0, 0, both),
-        (network.biases[-1], 0, 0, both),
-        *((reader.weight, reader.dimension, reader.first, kept) for reader in model.readers()),
-    ]
+    changes: list[tuple[Tensor, int, int, Tensor]] = [(model.references, 1, 0, kept)]
+    for network in model.entropy.reference_networks:
+        changes += [(network.weights[-1], 0, 0, both), (network.biases[-1], 0, 0, both)]
+        changes += [(parameter, 0, 0, kept) for parameter in network.per_channel]
+    changes += [(reader.weight, reader.dimension, reader.first, kept) for reader in model.readers()]
     for parameter, dimension, first, entries in changes:
         change = partial(_narrowed, dimension=dimension, first=first, kept=entries)
         replace_parameter(model, optimizer, parameter, change)
-    network.keep_channels(kept)
+    for network in model.entropy.reference_networks:
+        network.keep_channels(kept)
     for _, head in model.heads.networks():
         head.anchor_dim -= len(kept) - model.reference_dim
 
@@ -121,10 +120,10 @@ def _spread(references: Tensor) -> np.ndarray:
 
 def _along_references(model: TrainedModel) -> Iterator[tuple[Tensor, int, int]]:
     """Parameters with a dimension along the references' channels: that dimension, and where these begin in it."""
-    network = model.entropy.reference_network
     yield model.references, 1, 0
-    yield network.weights[-1], 0, 0  # rows of the means; those of the scales come after them
-    yield network.biases[-1], 0, 0
+    for network in model.entropy.reference_networks:
+        yield network.weights[-1], 0, 0  # rows of the means; those of the scales come after them
+        yield network.biases[-1], 0, 0
     for reader in model.readers():
         yield reader.weight, reader.dimension, reader.first
 

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.codec.anchor_order import canonical_order
 from compgs.codec.mask_coder import encode_masks
 from compgs.codec.octree import encode_positions
 from compgs.entropy.network import FRACTION_BITS
 from compgs.entropy.quantization import weight_exponent
+from compgs.ordering.order import canonical_order
 from compgs.trained_model import TrainedModel
 
 POSITION_BITS = 10.0  # that one anchor less saves of the positions, about
@@ -59,8 +59,8 @@ def geometry_bytes(
 
 
 def anchor_bits(model: TrainedModel) -> Tensor:
-    """[N] bits of each anchor's latents and position, all anchors being coded."""
-    bits = model.bits_of_anchors()
+    """[N] bits of each anchor's latents and position as training pays for them, all anchors being coded."""
+    bits = model.bits_of_anchors(in_file=False)
     return torch.stack(list(bits.values())).sum(0) + POSITION_BITS
 
 

@@ -14,7 +14,7 @@ from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
 from compgs.training.grid import grid_spacings
-from compgs.training.network_size import has_hyperprior, head_bits, head_layout, hidden_width
+from compgs.training.network_size import head_bits, head_layout, hidden_width, reference_context
 from compgs.training.own_residuals import coupled_primitives, own_residuals
 
 COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
@@ -65,7 +65,7 @@ def made_for(config: Config, anchors: int, views: int) -> ModelConfig:
         config.model,
         coupled_primitives=coupled_primitives(config, anchors, views),
         width=hidden_width(config, anchors),
-        hyperprior=has_hyperprior(config, anchors),
+        reference_context=reference_context(config, anchors),
         heads=head_layout(config, anchors, views),
         residuals=own_residuals(config, anchors, views),
     )

@@ -8,7 +8,7 @@ weights cost less than they save. Where anchors are many, or bits cheap, nothing
 from typing import Literal
 
 from compgs.config import Config
-from compgs.training.own_residuals import CHEAP_BYTES, Limits, long_run
+from compgs.training.own_residuals import CHEAP_BYTES, Limits, often_seen
 
 # Hidden units from a price of a bit on, lambda / N as the run starts (docs/log/2026-11-23-14-pruning.md).
 WIDTHS = ((6e-7, 24), (1e-6, 16), (1.5e-6, 8))
@@ -23,11 +23,11 @@ def hidden_width(config: Config, anchors: int) -> int:
     return min([config.model.width, *_narrower(config, anchors)])
 
 
-def has_hyperprior(config: Config, anchors: int) -> bool:
-    """Whether a run that starts with so many anchors has one: not where networks are narrower. In their principal axes
-    references have so little in common that it hardly saves what it costs, and its network and tables cost, too.
+def reference_context(config: Config, anchors: int) -> Literal["neighbours", "hyperprior", "none"]:
+    """Of a run that starts with so many anchors: none where networks are narrower. In so small a file a context hardly
+    saves what its network costs.
     """
-    return config.model.hyperprior and not _narrower(config, anchors)
+    return "none" if _narrower(config, anchors) else config.model.reference_context
 
 
 def _narrower(config: Config, anchors: int) -> list[int]:
@@ -49,8 +49,8 @@ def head_bits(config: Config, lmbda: float, anchors: int) -> int:
 
 
 def head_layout(config: Config, anchors: int, views: int) -> Literal["separate", "paired"]:
-    """Of a run that starts with so many anchors: separate networks also where a long run has the time for them, and
-    bits are so cheap that twice as many weights hardly count.
+    """Of a run that starts with so many anchors: separate networks also where a run that sees its views often has the
+    time for them, and bits are so cheap that twice as many weights hardly count.
     """
     cheap = Limits(config.model.separate_where_long, CHEAP_BYTES).met(config, anchors)
-    return "separate" if cheap and long_run(config, views) else config.model.heads
+    return "separate" if cheap and often_seen(config, views) else config.model.heads

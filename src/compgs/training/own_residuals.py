@@ -58,8 +58,12 @@ def _limits(config: Config, views: int) -> Limits:
 
 def long_run(config: Config, views: int) -> bool:
     """Whether there is the time to learn what many views show beyond what all anchors can share."""
-    looked_at = config.training.steps * config.training.views_per_step
-    return fewness(views) < FEW_ENOUGH and looked_at >= PASSES * views
+    return fewness(views) < FEW_ENOUGH and often_seen(config, views)
+
+
+def often_seen(config: Config, views: int) -> bool:
+    """Whether a run passes over its training views often."""
+    return config.training.steps * config.training.views_per_step >= PASSES * views
 
 
 def coupled_primitives(config: Config, anchors: int, views: int) -> int:

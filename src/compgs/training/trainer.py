@@ -198,6 +198,7 @@ class Trainer:
             results = [self.learn_from(shown, geometry, looks, number) for number in looks.own.numbers]
         rate = self.rate_of(latents, looks)
         self.pull(latents, shown, rate)
+        self.learn_neighbours(latents, looks)
         loss = torch.stack([result.loss for result in results]).sum()
         if rate is not None and self.rate.lmbda > 0:
             loss = rate_distortion_loss(loss, rate.detach(), self.rate.lmbda)
@@ -322,8 +323,8 @@ class Trainer:
         if not latents.bits:
             return None
         channels, normalization = self.model.entropy.channels, self.config.training.rate
-        parts = [latents.of(looks.own.part_of(number)).bits for number in looks.own.numbers]
-        rates = [rate(bits, channels, normalization) for bits in parts]
+        parts = [latents.of(looks.own.part_of(number)) for number in looks.own.numbers]
+        rates = [rate(part.bits, channels, normalization) for part in parts]
         return self.rate_weight * torch.stack(rates).sum()
 
     def backward(self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians) -> None:
@@ -340,6 +341,13 @@ class Trainer:
             rate.backward(inputs=self.model.entropy.statistics(), retain_graph=True)
             rate = None
         pull_back(latents.latents(), shown.latents(), rate)
+
+    def learn_neighbours(self, latents: Quantized, looks: StepViews) -> None:
+        """What the references cost given their neighbours, as in the file; only their network learns of it."""
+        if latents.neighbour_bits is None:
+            return
+        parts = [latents.of(looks.own.part_of(number)).neighbour_bits for number in looks.own.numbers]
+        torch.stack([bits.mean() for bits in parts if bits is not None]).sum().backward()
 
     def update(self, looks: StepViews, loss: Tensor) -> None:
         """Adam's step, after views of the anchors in `looks`; each channel of the references by its own rate.
@@ -597,6 +605,7 @@ PARTS = {
     "backward": "prediction, backward",
     "rate_of": "entropy",
     "pull": "entropy, backward",
+    "learn_neighbours": "entropy, backward",
     "update": "optimizer",
     "observe": "control",
     "finish_step": "control",

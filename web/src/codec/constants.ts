@@ -1,7 +1,8 @@
 /** The constants of docs/bitstream.md, under the same names. */
 
 export const MAGIC = [0x93, 0x43, 0x47, 0x53] as const;
-export const VERSION = 2;
+export const VERSION = 3;
+export const OLDEST_VERSION = 2;
 export const OPTIONAL = 0x80;
 export const MAX_SECTIONS = 64;
 export const MAX_ANCHORS = 1 << 24;
@@ -47,6 +48,8 @@ export const MAX_RANK = 4;
 export const MAX_EXPONENT = 62;
 export const MAX_WEIGHTS = 1 << 22;
 export const MAX_LOW_BITS = 26;
+export const FOLLOW_LIMIT = 2 ** 28;
+export const NEAREST_WEIGHT = 2 ** 24;
 /** Levels of the octree; a coordinate's offset has so many bits. */
 export const MAX_DEPTH = 21;
 /** Log scales of an anchor: three of its reach, three of its size. */

@@ -1,7 +1,7 @@
 /** From bytes to checksummed sections (docs/bitstream.md, "File" and "What a decoder must refuse"). */
 
 import { CorruptSection, NotACompGSFile, TruncatedSection, UnsupportedVersion } from "../errors.ts";
-import { MAGIC, MAX_RANGES, MAX_SECTIONS, OPTIONAL, VERSION } from "./constants.ts";
+import { MAGIC, MAX_RANGES, MAX_SECTIONS, OLDEST_VERSION, OPTIONAL, VERSION } from "./constants.ts";
 import { crc32 } from "./crc32.ts";
 
 export const SectionNumber = {
@@ -53,14 +53,22 @@ export interface SectionEntry {
   crc: number;
 }
 
+export interface Header {
+  version: number;
+  entries: SectionEntry[];
+}
+
 /**
- * The sections of a file, their checksums verified, and whether all its latents are among them.
+ * A file's version, its sections, their checksums verified, and whether all its latents are among them.
  *
  * With `prefix` the file may end early: the sections before the first that is not there to its end. The first section
  * of latents and all before it must be there.
  */
-export function unpack(file: Uint8Array, prefix: boolean): { sections: Section[]; hasAllLatents: boolean } {
-  const entries = readHeader(file);
+export function unpack(
+  file: Uint8Array,
+  prefix: boolean,
+): { version: number; sections: Section[]; hasAllLatents: boolean } {
+  const { version, entries } = readHeader(file);
   const isLatents = ({ number }: { number: number }): boolean => number === SectionNumber.latents;
   const sections: Section[] = [];
   for (const entry of entries) {
@@ -68,6 +76,7 @@ export function unpack(file: Uint8Array, prefix: boolean): { sections: Section[]
     if (end > file.length) {
       if (prefix && sections.some(isLatents)) {
         return {
+          version,
           sections,
           hasAllLatents: sections.filter(isLatents).length === entries.filter(isLatents).length,
         };
@@ -81,7 +90,7 @@ export function unpack(file: Uint8Array, prefix: boolean): { sections: Section[]
   const last = entries[entries.length - 1]!;
   const extra = file.length - (last.start + last.length);
   if (extra > 0) throw new CorruptSection(`file: ${extra} bytes after the last section`);
-  return { sections, hasAllLatents: true };
+  return { version, sections, hasAllLatents: true };
 }
 
 /** A section whose bytes are all there. */
@@ -91,15 +100,17 @@ export function unpackSection(file: Uint8Array, { number, name, start, length, c
   return { number, name, payload, end: start + length };
 }
 
-/** The section table of a file whose header is whole: checks 1 to 9. */
-export function readHeader(file: Uint8Array): SectionEntry[] {
+/** The header of a file in which it is whole: checks 1 to 9. */
+export function readHeader(file: Uint8Array): Header {
   const isMagic = MAGIC.slice(0, file.length).every((byte, i) => file[i] === byte);
   if (!isMagic)
     throw new NotACompGSFile(`file: expected to begin with 93 43 47 53, found ${hex(file.subarray(0, 4))}`);
   if (file.length < START_BYTES) throw new TruncatedSection(`header: file ends after ${file.length} bytes`);
   const [version, flags, count] = [file[4]!, file[5]!, file[6]!];
-  if (version !== VERSION) {
-    throw new UnsupportedVersion(`file: version ${version}, this decoder reads version ${VERSION}`);
+  if (version < OLDEST_VERSION || version > VERSION) {
+    throw new UnsupportedVersion(
+      `file: version ${version}, this decoder reads versions ${OLDEST_VERSION} to ${VERSION}`,
+    );
   }
   const size = START_BYTES + count * ENTRY_BYTES + CRC_BYTES;
   if (file.length < size)
@@ -127,7 +138,7 @@ export function readHeader(file: Uint8Array): SectionEntry[] {
     start += length;
   }
   checkNumbers(entries.map((entry) => entry.number));
-  return entries;
+  return { version, entries };
 }
 
 function checkNumbers(numbers: number[]): void {

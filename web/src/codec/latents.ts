@@ -10,6 +10,7 @@ import {
 } from "./constants.ts";
 import { FieldReader } from "./fields.ts";
 import type { Kernels } from "./kernels.ts";
+import { type EarlierAnchors, NEIGHBOUR_INPUTS, type Surroundings, followNeighbours } from "./neighbours.ts";
 import type { IntegerNetwork } from "./networks.ts";
 import { type GroupShape, Role } from "./scene_section.ts";
 import { readStream } from "./streams.ts";
@@ -34,7 +35,7 @@ export function readRangeHead(reader: FieldReader): RangeHead {
   };
 }
 
-/** What a range's symbols depend on: its anchors, in canonical order. */
+/** What a range's symbols depend on: its anchors, in canonical order, and the ranges before. */
 export interface RangeAnchors {
   count: number;
   /** [count, 3] */
@@ -44,6 +45,14 @@ export interface RangeAnchors {
   mask: Uint8Array;
   slots: number;
   coupled: number;
+  /** Null for the first range. */
+  earlier: EarlierRanges | null;
+}
+
+export interface EarlierRanges {
+  anchors: EarlierAnchors;
+  /** Of each range what `readRange` has given. */
+  pieces: GroupLatents[][];
 }
 
 export interface GroupLatents {
@@ -97,6 +106,8 @@ function readByNetwork(
   before: GroupLatents[],
   kernels: Kernels,
 ): GroupLatents {
+  const surroundings = group.seesNeighbours ? surroundingsOf(before.length, network, anchors) : null;
+  const sources = inputSources(group, anchors, before, surroundings);
   const count = symbolCount(group, anchors);
   const choices = new Uint8Array(count);
   const means = new Int32Array(count);
@@ -104,17 +115,17 @@ function readByNetwork(
   let at = 0;
   for (let first = 0; first < anchors.count; first += most) {
     const rows = Math.min(most, anchors.count - first);
-    const outputs = kernels.evaluate(
-      network,
-      networkInputs(group, network, anchors, before, first, rows),
-      rows,
-    );
+    const outputs = kernels.evaluate(network, networkInputs(network, sources, first, rows), rows);
     forEachSymbol(group, anchors, first, rows, (row, column) => {
       const place = row * network.outputs + column;
       means[at] = outputs[place]!;
       const scale = (outputs[place + group.width]! + ONE / 2) >> FRACTION_BITS;
       choices[at++] = scale < 0 ? 0 : scale > GAUSSIAN_COUNT - 1 ? GAUSSIAN_COUNT - 1 : scale;
     });
+  }
+  if (network.follow) {
+    const around = surroundings?.around ?? new Int32Array(count); // in the first range nothing is known
+    followNeighbours(means, around, centreOf(network), network.follow);
   }
   const symbols = readStream(reader, gaussianTables(), choices, -MAX_SYMBOL, MAX_SYMBOL, kernels);
   const latents = means;
@@ -144,32 +155,72 @@ function forEachSymbol(
   }
 }
 
-/** [rows, inputs], Q12: coordinates if the group sees them, then the latents of its context, side by side. */
-function networkInputs(
-  group: GroupShape,
+/** Some of a network's inputs, side by side: `width` numbers of each anchor of the range, Q12. */
+interface Source {
+  width: number;
+  /** The number at a place of [count, width]. */
+  at: (place: number) => number;
+}
+
+/** What neighbours have of a group; null in the first range, where all of it is 0. */
+function surroundingsOf(
+  index: number,
   network: IntegerNetwork,
+  { offsets, earlier }: RangeAnchors,
+): Surroundings | null {
+  if (!earlier) return null;
+  const latents = concatenate(earlier.pieces.map((piece) => piece[index]!.latents));
+  return earlier.anchors.surroundings(offsets, latents, centreOf(network));
+}
+
+/** Begins with the mean of each channel where nothing is known. */
+function centreOf(network: IntegerNetwork): Int32Array {
+  return network.layers[network.layers.length - 1]!.bias;
+}
+
+/** What a group's network takes, in the order of its inputs; `before`: the groups before it, of the same range. */
+function inputSources(
+  group: GroupShape,
   anchors: RangeAnchors,
   before: GroupLatents[],
-  first: number,
-  rows: number,
-): Int32Array {
-  const inputs = new Int32Array(rows * network.inputs);
-  let column = 0;
-  const put = (width: number, value: (place: number) => number): void => {
-    for (let row = 0; row < rows; row++) {
-      for (let c = 0; c < width; c++)
-        inputs[row * network.inputs + column + c] = value((first + row) * width + c);
-    }
-    column += width;
-  };
+  surroundings: Surroundings | null,
+): Source[] {
+  const sources: Source[] = [];
   if (group.seesCoordinates) {
     const scale = 2 ** -anchors.depth;
     // Up to 2^34 before the shift.
-    put(3, (place) => Math.floor((2 * anchors.offsets[place]! + 1) * ONE * scale) - ONE);
+    const at = (place: number) => Math.floor((2 * anchors.offsets[place]! + 1) * ONE * scale) - ONE;
+    sources.push({ width: 3, at });
   }
   for (const j of group.context) {
     const { latents } = before[j]!;
-    put(latents.length / anchors.count, (place) => latents[place]!);
+    sources.push({ width: latents.length / anchors.count, at: (place) => latents[place]! });
+  }
+  if (surroundings) sources.push({ width: NEIGHBOUR_INPUTS, at: (place) => surroundings.inputs[place]! });
+  return sources;
+}
+
+/** [rows, inputs], Q12: of the anchors from `first` on, what the sources have, and 0 where none is left: neighbours in the first range. */
+function networkInputs(network: IntegerNetwork, sources: Source[], first: number, rows: number): Int32Array {
+  const inputs = new Int32Array(rows * network.inputs);
+  let column = 0;
+  for (const { width, at } of sources) {
+    for (let row = 0; row < rows; row++) {
+      for (let c = 0; c < width; c++)
+        inputs[row * network.inputs + column + c] = at((first + row) * width + c);
+    }
+    column += width;
   }
   return inputs;
+}
+
+export function concatenate(pieces: Int32Array[]): Int32Array {
+  if (pieces.length === 1) return pieces[0]!;
+  const all = new Int32Array(pieces.reduce((sum, piece) => sum + piece.length, 0));
+  let at = 0;
+  for (const piece of pieces) {
+    all.set(piece, at);
+    at += piece.length;
+  }
+  return all;
 }

@@ -3,7 +3,7 @@
 import { ACTIVATION_LIMIT, SLOPE_BITS } from "./constants.ts";
 import type { IntegerLayer, IntegerNetwork } from "./networks.ts";
 
-const clampActivation = (x: number): number =>
+export const clampActivation = (x: number): number =>
   x < -ACTIVATION_LIMIT ? -ACTIVATION_LIMIT : x > ACTIVATION_LIMIT - 1 ? ACTIVATION_LIMIT - 1 : x;
 
 /** Outputs [rows, outputs] for inputs [rows, inputs], Q12. */

@@ -4,6 +4,7 @@ import {
   ACCUMULATOR_LIMIT,
   ACTIVATION_LIMIT,
   BIAS_LIMIT,
+  FOLLOW_LIMIT,
   MAX_LAYERS,
   MAX_LAYER_WIDTH,
   MAX_SHIFT,
@@ -30,15 +31,28 @@ export interface IntegerLayer {
   adds: boolean;
 }
 
+/** How the means that a network gives follow what neighbours have. */
+export interface Follow {
+  /** [channels] */
+  weight: Int32Array;
+  shift: number;
+}
+
 export interface IntegerNetwork {
   inputs: number;
   outputs: number;
   layers: IntegerLayer[];
   /** Whether the last layer takes the network's inputs, too. */
   skip: boolean;
+  /** Null but for a group that sees neighbours. */
+  follow: Follow | null;
 }
 
 type LayerHead = Omit<IntegerLayer, "weight" | "bias">;
+interface NetworkHead extends Omit<IntegerNetwork, "layers" | "follow"> {
+  layers: LayerHead[];
+  followShift: number | null;
+}
 
 /** For each group its network, or null; and the number of all elements of their weights. */
 export function readNetworks(
@@ -50,13 +64,10 @@ export function readNetworks(
   const reader = new FieldReader(payload, name);
   const heads = groups.map((group) => (group.hasNetwork ? readHead(reader, group) : null));
   const layers = heads.flatMap((head) => head?.layers ?? []);
-  const sizes = layers.flatMap(({ inputs, outputs }) => {
-    const half = Math.ceil(outputs / 2);
-    return [half * inputs, (outputs - half) * inputs, half, outputs - half];
-  });
+  const sizes = heads.flatMap((head) => (head ? arraySizes(head) : []));
   const elements = sizes.reduce((a, b) => a + b, 0);
   if (elements > MAX_WEIGHTS)
-    reader.refuse(`${elements} weights and biases, at most ${MAX_WEIGHTS} are allowed`);
+    reader.refuse(`${elements} weights, biases and follow, at most ${MAX_WEIGHTS} are allowed`);
   const arrays = layers.length ? readArrays(reader, sizes, kernels) : [];
   reader.end();
   let next = 0;
@@ -68,15 +79,14 @@ export function readNetworks(
       next += 4;
       return checked({ ...layer, weight, bias }, reader);
     });
-    return { ...head, layers: whole };
+    const { inputs, outputs, skip, followShift: shift } = head;
+    const follow = shift === null ? null : checkedFollow({ weight: arrays[next++]!, shift }, reader);
+    return { inputs, outputs, layers: whole, skip, follow };
   });
   return { networks, weights: layers.reduce((sum, layer) => sum + layer.inputs * layer.outputs, 0) };
 }
 
-function readHead(
-  reader: FieldReader,
-  group: GroupShape,
-): Omit<IntegerNetwork, "layers"> & { layers: LayerHead[] } {
+function readHead(reader: FieldReader, group: GroupShape): NetworkHead {
   const count = reader.varint("layers", 1, MAX_LAYERS);
   const flags = reader.u8("flags of a network");
   if (flags > (count > 1 ? 1 : 0)) reader.refuse(`flags of a network of ${count} layers are ${flags}`);
@@ -98,7 +108,21 @@ function readHead(
     }
     layers.push({ inputs, outputs: width, shift, rectify: (bits & RECTIFY) !== 0, adds });
   }
-  return { inputs: group.inputs, outputs, layers, skip };
+  const followShift = group.seesNeighbours ? reader.u8("follow_shift") : null;
+  if (followShift !== null && followShift > MAX_SHIFT)
+    reader.refuse(`follow_shift is ${followShift}, expected 0 to ${MAX_SHIFT}`);
+  return { inputs: group.inputs, outputs, layers, skip, followShift };
+}
+
+/** Of a network's arrays, in the order of the file. */
+function arraySizes({ layers, outputs, followShift }: NetworkHead): number[] {
+  const sizes = layers.flatMap((layer) => {
+    const half = Math.ceil(layer.outputs / 2);
+    const rest = layer.outputs - half;
+    return [half * layer.inputs, rest * layer.inputs, half, rest];
+  });
+  // A mean for each channel, and a scale.
+  return followShift === null ? sizes : [...sizes, outputs / 2];
 }
 
 function joined(a: Int32Array, b: Int32Array): Int32Array {
@@ -119,4 +143,12 @@ function checked(layer: IntegerLayer, reader: FieldReader): IntegerLayer {
   }
   for (const bias of layer.bias) if (Math.abs(bias) >= BIAS_LIMIT) reader.refuse(`a bias is ${bias}`);
   return layer;
+}
+
+/** The bound within which its products are exact, too. */
+function checkedFollow(follow: Follow, reader: FieldReader): Follow {
+  for (const weight of follow.weight) {
+    if (Math.abs(weight) >= FOLLOW_LIMIT) reader.refuse(`an element of follow is ${weight}`);
+  }
+  return follow;
 }

@@ -9,10 +9,18 @@ import { type Section, SectionNumber } from "./container.ts";
 import { FieldReader } from "./fields.ts";
 import { type Tensor, readHeads } from "./heads.ts";
 import type { Kernels } from "./kernels.ts";
-import { type GroupLatents, type RangeHead, readRange, readRangeHead } from "./latents.ts";
+import {
+  type EarlierRanges,
+  type GroupLatents,
+  type RangeHead,
+  concatenate,
+  readRange,
+  readRangeHead,
+} from "./latents.ts";
 import { checkHeadProducts, checkNetworkProducts, checkSymbols } from "./limits.ts";
 import { readMasks } from "./masks.ts";
 import { checkPadding, readMetadata } from "./metadata.ts";
+import { EarlierAnchors } from "./neighbours.ts";
 import { type IntegerNetwork, readNetworks } from "./networks.ts";
 import { readPositions } from "./positions.ts";
 import { type GroupShape, type SceneSection, readScene } from "./scene_section.ts";
@@ -82,6 +90,7 @@ export class SceneDecoder {
    * `bytes`: length of the file, or of what has arrived of it; `whole`: whether all anchors will be decoded.
    */
   constructor(
+    version: number,
     sections: Section[],
     private readonly kernels: Kernels,
     bytes: number,
@@ -94,7 +103,7 @@ export class SceneDecoder {
     const [tables, networks, heads] = [SectionNumber.tables, SectionNumber.networks, SectionNumber.heads].map(
       find,
     );
-    this.section = readScene(scene!.payload, scene!.name);
+    this.section = readScene(scene!.payload, scene!.name, version);
     const { anchors, coupled, coupledPrimitives, groups } = this.section;
     if (whole) checkSymbols(anchors, groups, bytes);
     this.tables = readTables(tables!.payload, groups, tables!.name, kernels);
@@ -151,11 +160,18 @@ export class SceneDecoder {
       mask: this.mask.subarray(coupledPrimitives * first, coupledPrimitives * end),
       slots: coupledPrimitives,
       coupled: head.coupled,
+      earlier: this.earlierRanges(),
     };
     this.pieces.push(readRange(reader, groups, this.tables, this.networks, range, this.kernels));
     this.ranges.push(head);
     this.anchors = end;
     this.coupled += head.coupled;
+  }
+
+  private earlierRanges(): EarlierRanges | null {
+    if (!this.ranges.length) return null;
+    const offsets = this.offsets.subarray(0, 3 * this.anchors);
+    return { anchors: new EarlierAnchors(offsets, this.depth - this.level), pieces: this.pieces };
   }
 
   private checkHead(head: RangeHead, reader: FieldReader): void {
@@ -210,17 +226,6 @@ export class SceneDecoder {
       metadata: this.metadata,
     };
   }
-}
-
-function concatenate(pieces: Int32Array[]): Int32Array {
-  if (pieces.length === 1) return pieces[0]!;
-  const all = new Int32Array(pieces.reduce((sum, piece) => sum + piece.length, 0));
-  let at = 0;
-  for (const piece of pieces) {
-    all.set(piece, at);
-    at += piece.length;
-  }
-  return all;
 }
 
 function countOnes(mask: Uint8Array): number {

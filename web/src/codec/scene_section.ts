@@ -14,6 +14,7 @@ import {
   SMALLEST,
 } from "./constants.ts";
 import { FieldReader } from "./fields.ts";
+import { NEIGHBOUR_INPUTS } from "./neighbours.ts";
 
 export const Role = { side: 0, reference: 1, logScales: 2, residual: 3 } as const;
 
@@ -28,6 +29,8 @@ export interface GroupShape {
   seesCoordinates: boolean;
   /** Groups whose latents its network takes, ascending. */
   context: number[];
+  /** Whether its network takes what the anchor's neighbours have of this group, and its means follow it. */
+  seesNeighbours: boolean;
   /** Quantization steps: none (role side), one, or one for each channel. */
   steps: number[];
   /** Symbols of an anchor that has all its coupled primitives. */
@@ -52,7 +55,7 @@ export interface SceneSection {
   groups: GroupShape[];
 }
 
-export function readScene(payload: Uint8Array, name: string): SceneSection {
+export function readScene(payload: Uint8Array, name: string, version: number): SceneSection {
   const reader = new FieldReader(payload, name);
   const between = (what: string, value: number, least: number, most: number): number => {
     if (!(value >= least && value <= most))
@@ -85,7 +88,7 @@ export function readScene(payload: Uint8Array, name: string): SceneSection {
   const background: [number, number, number] = [color(), color(), color()];
   const count = between("groups", reader.u8("groups"), 1, MAX_GROUPS);
   const groups: GroupShape[] = [];
-  for (let i = 0; i < count; i++) groups.push(readGroup(reader, groups, coupledPrimitives));
+  for (let i = 0; i < count; i++) groups.push(readGroup(reader, version, groups, coupledPrimitives));
   reader.end();
   const referenceDim = between(
     "reference channels",
@@ -117,11 +120,18 @@ export function channelsOf(groups: GroupShape[], role: number): number {
   return groups.reduce((sum, group) => sum + (group.role === role ? group.channels : 0), 0);
 }
 
-function readGroup(reader: FieldReader, before: GroupShape[], coupledPrimitives: number): GroupShape {
+function readGroup(
+  reader: FieldReader,
+  version: number,
+  before: GroupShape[],
+  coupledPrimitives: number,
+): GroupShape {
   const index = before.length;
   const role = reader.varint(`role of group ${index}`, 0, 3);
   const channels = reader.varint(`channels of group ${index}`, 1, CHANNEL_LIMITS[role]!);
-  const bits = reader.varint(`context of group ${index}`, 0, 2 ** (index + 1) - 1);
+  // Neighbours came with version 3.
+  const bitCount = version < 3 ? index + 1 : index + 2;
+  const bits = reader.varint(`context of group ${index}`, 0, 2 ** bitCount - 1);
   const stepCount = reader.varint(`steps of group ${index}`, 0, channels);
   const isLegal = role === Role.side ? stepCount === 0 : stepCount === 1 || stepCount === channels;
   if (!isLegal) reader.refuse(`group ${index} of role ${role} has ${stepCount} steps`);
@@ -135,11 +145,17 @@ function readGroup(reader: FieldReader, before: GroupShape[], coupledPrimitives:
   const residual = context.find((j) => before[j]!.role === Role.residual);
   if (residual !== undefined)
     reader.refuse(`group ${index} takes group ${residual}, whose latents are residuals`);
+  const seesNeighbours = ((bits >> (index + 1)) & 1) === 1;
+  if (seesNeighbours && role === Role.residual)
+    reader.refuse(`group ${index} takes what neighbours have, and its latents are residuals`);
   const width = role === Role.residual ? channels * coupledPrimitives : channels;
   const hasNetwork = bits !== 0;
   if (!hasNetwork && width > MAX_TABLES)
     reader.refuse(`group ${index} needs ${width} tables, at most ${MAX_TABLES}`);
   const seesCoordinates = (bits & 1) === 1;
-  const inputs = context.reduce((sum, j) => sum + before[j]!.channels, seesCoordinates ? 3 : 0);
-  return { role, channels, seesCoordinates, context, steps, width, inputs, hasNetwork };
+  const inputs =
+    (seesCoordinates ? 3 : 0) +
+    context.reduce((sum, j) => sum + before[j]!.channels, 0) +
+    (seesNeighbours ? NEIGHBOUR_INPUTS : 0);
+  return { role, channels, seesCoordinates, context, seesNeighbours, steps, width, inputs, hasNetwork };
 }

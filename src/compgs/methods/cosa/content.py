@@ -13,7 +13,7 @@ from compgs.methods.cosa.shape import ChainShape
 
 @dataclass(frozen=True, eq=False)
 class CosaContent:
-    """N anchors, in canonical order (`codec/anchor_order.py`), each with a primitive at least."""
+    """N anchors, in canonical order (`ordering/order.py`), each with a primitive at least."""
 
     shape: ChainShape
     frame: Frame

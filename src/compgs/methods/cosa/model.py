@@ -4,7 +4,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from compgs.codec.anchor_order import octree_depth, octree_origin
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import quantize_weight, weight_exponent
@@ -15,6 +14,7 @@ from compgs.methods.cosa.chain import coordinate_inputs
 from compgs.methods.cosa.entropy import CausalChain, Chained, ContextNetwork, Noise
 from compgs.methods.cosa.settings import CosaConfig
 from compgs.methods.cosa.shape import ChainShape
+from compgs.ordering.order import octree_depth, octree_origin
 from compgs.training.file_size import OTHER_BYTES, gaussian_entropy
 
 NOT_BEGUN = -1  # depth of the cube while there is no rate

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from compgs.codec.anchor_order import canonical_order
 from compgs.codec.encoder import ONE, integer_network, quantized_tensor
 from compgs.codec.format import MAX_SYMBOL
 from compgs.codec.integer_network import IntegerLayer, IntegerNetwork
@@ -25,6 +24,7 @@ from compgs.methods.cosa.content import CosaContent
 from compgs.methods.cosa.entropy import ContextNetwork
 from compgs.methods.cosa.model import CosaModel
 from compgs.methods.cosa.shape import GROUPS
+from compgs.ordering.order import canonical_order
 
 
 @torch.no_grad()

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from compgs.codec.anchor_order import (
+from compgs.errors import NotEncodable
+from compgs.ordering.order import (
     canonical_order,
     inv_morton_codes,
     level_counts,
@@ -14,7 +15,6 @@ from compgs.codec.anchor_order import (
     octree_depth,
     octree_origin,
 )
-from compgs.errors import NotEncodable
 
 
 @st.composite
