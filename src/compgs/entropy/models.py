@@ -40,9 +40,8 @@ class Quantized:
     covariances: Tensor  # [N, 6]
     residuals: Tensor  # [N, K * residual_dim]
     bits: dict[str, Tensor]  # stream -> [N] bits per anchor, as training pays for; empty when not asked for
-    neighbour_bits: Tensor | None = (
-        None  # [N] of the references in the file, if they are coded around neighbours
-    )
+    # [N] of the references in the file, if they are coded around neighbours
+    neighbour_bits: Tensor | None = None
 
     @property
     def bits_in_file(self) -> dict[str, Tensor]:
@@ -188,8 +187,8 @@ class EntropyModel(nn.Module):
         noise: Callable[[Tensor], Tensor] | None = None,
         network_bits: int | None = None,
         mask: Tensor | None = None,  # [N, K] bool: coupled primitives that are coded; default all
-        around: Tensor
-        | None = None,  # [N, 2 + reference_dim] `Neighbourhood.around`, if references see neighbours
+        # [N, 2 + reference_dim] `Neighbourhood.around`, if references see neighbours and `rate`
+        around: Tensor | None = None,
     ) -> Quantized:
         """Quantize, and estimate the bits if `rate`.
 
