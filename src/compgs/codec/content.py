@@ -223,10 +223,14 @@ class Surroundings:
         return neighbour_context(network, earlier, self.offsets[:end], lambda: self.neighbours(number))
 
 
-def surroundings(coordinates: np.ndarray, levels: Sequence[int] | None = None) -> Surroundings:
-    """Of [N, 3] voxels in canonical order; `levels`: last octree level of each range, by default `chosen_levels`."""
+def surroundings(
+    coordinates: np.ndarray, levels: Sequence[int] | None = None, counts: np.ndarray | None = None
+) -> Surroundings:
+    """Of [N, 3] voxels in canonical order; `levels`: last octree level of each range, by default `chosen_levels`;
+    `counts`: `level_counts`, if that is known.
+    """
     offsets = coordinates.astype(np.int64) - octree_origin(coordinates)
-    depth, counts = octree_depth(offsets), level_counts(coordinates)
+    depth, counts = octree_depth(offsets), level_counts(coordinates) if counts is None else counts
     levels = chosen_levels(counts) if levels is None else levels
     ends = tuple(int(counts[level]) for level in levels)
     return Surroundings(offsets.astype(np.int32), depth, tuple(levels), ends)

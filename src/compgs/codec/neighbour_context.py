@@ -27,17 +27,33 @@ def neighbour_context(
     out = np.zeros((len(offsets) - len(earlier), BESIDES + len(centre)), np.int32)
     if len(earlier):
         found = neighbours()
-        _say(found.node, found.around, offsets, earlier, centre.astype(np.float64), out)
+        deviations = np.empty((len(earlier), len(centre)))
+        sizes = np.empty(len(earlier), np.int64)
+        _deviate(earlier, centre.astype(np.float64), deviations, sizes)
+        _say(found.node, found.around, offsets, deviations, sizes, out)
     return out
 
 
 @njit(parallel=True)
-def _say(node, around, offsets, earlier, centre, out, share):
-    known, channels = len(earlier), len(centre)
+def _deviate(earlier, centre, deviations, sizes, share):
+    """How far latents are from the centre, in each channel and on average."""
+    channels = len(centre)
     low, high = -float(ACTIVATION_LIMIT), float(ACTIVATION_LIMIT - 1)
+    for j in portion(len(earlier), share):
+        size = 0.0
+        for c in range(channels):
+            deviations[j, c] = min(max(earlier[j, c] - centre[c], low), high)
+            size += abs(deviations[j, c])
+        sizes[j] = np.int64(size) // channels
+
+
+@njit(parallel=True)
+def _say(node, around, offsets, deviations, sizes, out, share):
+    known, channels = deviations.shape
+    sums = np.empty(channels)
     for i in portion(len(out), share):
         a = known + i
-        sums = np.zeros(channels)
+        sums[:] = 0.0
         weights, activity = np.int64(0), np.int64(0)
         for place in range(AROUND):
             j = around[node[i], place]
@@ -49,13 +65,11 @@ def _say(node, around, offsets, earlier, centre, out, share):
                 + abs(np.int64(offsets[a, 2]) - offsets[j, 2])
             )
             weight = 1 + NEAREST_WEIGHT // distance
-            size = 0.0
-            for c in range(channels):
-                deviation = min(max(earlier[j, c] - centre[c], low), high)
-                sums[c] += float(weight) * deviation
-                size += abs(deviation)
             weights += weight
-            activity += weight * (np.int64(size) // channels)
+            activity += weight * sizes[j]
+            factor = float(weight)
+            for c in range(channels):
+                sums[c] += factor * deviations[j, c]
         out[i, 0] = 1 << FRACTION_BITS
         out[i, 1] = activity // weights
         for c in range(channels):

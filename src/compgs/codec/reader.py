@@ -172,8 +172,9 @@ def read_latents(
             f"masks: {int(mask.sum())} coupled primitives exist, the scene section promises {scene.coupled}"
         )
     complete = len(ranges) == sum(number == LATENTS for number, _ in section_ends(data))
-    _check_ranges(heads_of_ranges, level_counts(coordinates), mask, whole=complete)
-    known = surroundings(coordinates, [head.level for head in heads_of_ranges])
+    counts = level_counts(coordinates)
+    _check_ranges(heads_of_ranges, counts, mask, whole=complete)
+    known = surroundings(coordinates, [head.level for head in heads_of_ranges], counts)
     whole = anchors == scene.anchors
     stands_for = None if whole else represented(coordinates, heads_of_ranges[-1].level)
     coordinates, mask = coordinates[:anchors], mask[:anchors]

@@ -22,7 +22,9 @@ class Neighbours:
     """Of the n anchors of a range: neighbours among the M of the ranges before. Anchors of a node share them."""
 
     node: NDArray[np.int32]  # [n] the anchor that represents their node
-    around: NDArray[np.int32]  # [M, AROUND] neighbours of all that are in its node; -1: there is none
+    around: NDArray[
+        np.int32
+    ]  # [M, AROUND] neighbours of all of the range in its node, if any; -1: there is none
 
     def weights(
         self, offsets: NDArray[np.int32]
@@ -51,10 +53,12 @@ def find_neighbours(offsets: NDArray[np.int32], known: int, shift: int) -> Neigh
     # Drawn anew each time: nobody can write a file all of whose nodes are looked for in one place.
     factors = np.array([secrets.randbits(64) | 1 for _ in range(3)], np.uint64)
     _enter(offsets[:known], shift, table, factors)
-    around = np.empty((known, AROUND), np.int32)
     node = np.empty(len(offsets) - known, np.int32)
-    _look_around(offsets, known, shift, table, factors, around)
     _look_up(offsets, known, shift, table, factors, node)
+    holds_some = np.zeros(known, np.bool_)
+    holds_some[node] = True
+    around = np.full((known, AROUND), -1, np.int32)
+    _look_around(offsets, holds_some, shift, table, factors, around)
     return Neighbours(node, around)
 
 
@@ -89,8 +93,10 @@ def _enter(offsets, shift, table, factors):
 
 
 @njit(parallel=True)
-def _look_around(offsets, known, shift, table, factors, around, share):
-    for j in portion(known, share):
+def _look_around(offsets, holds_some, shift, table, factors, around, share):
+    for j in portion(len(holds_some), share):
+        if not holds_some[j]:
+            continue
         x, y, z = offsets[j, 0] >> shift, offsets[j, 1] >> shift, offsets[j, 2] >> shift
         place = 0
         for dx in range(-1, 2):
