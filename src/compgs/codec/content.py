@@ -31,13 +31,13 @@ from compgs.codec.integer_network import (
     first_rows,
     follow_neighbours,
 )
-from compgs.codec.neighbour_context import BESIDES, neighbour_context
+from compgs.codec.neighbour_context import neighbour_context
 from compgs.codec.rans import escape_bits
 from compgs.codec.tables import FrequencyTables, HyperTable, channel_tables, gaussian_tables
 from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 from compgs.numerics.compiled import njit, portion
-from compgs.ordering.neighbours import Neighbours, find_neighbours
+from compgs.ordering.neighbours import BESIDES, Neighbours, find_neighbours
 from compgs.ordering.order import level_counts, octree_depth, octree_origin
 from compgs.ordering.ranges import chosen_levels
 

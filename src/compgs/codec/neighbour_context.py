@@ -11,9 +11,7 @@ import numpy as np
 
 from compgs.codec.integer_network import ACTIVATION_LIMIT, FRACTION_BITS, IntegerNetwork, centre_of
 from compgs.numerics.compiled import njit, portion
-from compgs.ordering.neighbours import AROUND, NEAREST_WEIGHT, Neighbours
-
-BESIDES = 2  # inputs of the network, before what its means follow: known, activity
+from compgs.ordering.neighbours import AROUND, BESIDES, NEAREST_WEIGHT, Neighbours
 
 
 def neighbour_context(

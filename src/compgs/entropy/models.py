@@ -18,8 +18,8 @@ from compgs.config import EntropyConfig, ModelConfig
 from compgs.entropy.conditional import code_latents
 from compgs.entropy.contexts import Hyperprior, NoContext
 from compgs.entropy.neighbour_network import NeighbourNetwork
-from compgs.entropy.neighbourhood import BESIDES
 from compgs.entropy.network import EntropyNetwork
+from compgs.ordering.neighbours import BESIDES
 from compgs.tensors.linear import Reader
 
 STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from compgs.entropy.neighbourhood import BESIDES
 from compgs.entropy.network import EntropyNetwork, round_fixed, round_half_up
 from compgs.entropy.quantization import quantize, quantize_weight
+from compgs.ordering.neighbours import BESIDES
 
 
 class NeighbourNetwork(EntropyNetwork):

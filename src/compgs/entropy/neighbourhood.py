@@ -11,11 +11,9 @@ import torch
 from torch import Tensor
 
 from compgs.numerics.compiled import njit, portion
-from compgs.ordering.neighbours import find_neighbours
+from compgs.ordering.neighbours import BESIDES, find_neighbours
 from compgs.ordering.order import canonical_order, level_counts, octree_depth, octree_origin
 from compgs.ordering.ranges import chosen_levels
-
-BESIDES = 2  # inputs beside those of the channels: known, activity
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from compgs.numerics.compiled import njit, portion
 
+# What a network takes of an anchor's neighbours, before what its means follow: known, activity.
+BESIDES = 2
 AROUND = 27  # nodes, the own one among them
 NEAREST_WEIGHT = 1 << 24  # of a neighbour at distance 1; others have less in proportion, and at least 1
 
