@@ -69,6 +69,7 @@ PUBLISHED = {
     "training.left_out": 0.0,
     "training.coarse_until": 0.0,
     "training.rate_every": 1,
+    "training.averaged": 0.0,
 }
 
 

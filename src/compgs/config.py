@@ -234,6 +234,8 @@ class TrainingConfig:
     appearance_dtype: Literal["float32", "bfloat16"] = "float32"
     # of the steps before the likelihood sees symbols in place of noise (soft then hard)
     hard_rate: Share = 0.8
+    # of the steps, the last ones: the file holds the mean of them; 0: where the last one went (not in the paper)
+    averaged: Share = 0.1
     # an affine change of color for each training view, for photographs of differing exposure or white balance: learned
     # beside the scene, and kept out of the file (`training/exposures.py`)
     exposure: bool = False

@@ -23,13 +23,13 @@ KINDS = {"compgs": Trainer, "3dgs": SplatTrainer}
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory, blob_scene) -> dict[str, tuple[Path, Any]]:
-    """A checkpoint of each kind after a few steps, with exposures, and its settings."""
+    """A checkpoint of each kind after a few steps, with exposures and a mean of them, and its settings."""
     from compgs.config import Config, ModelConfig, TrainingConfig
 
     folder = tmp_path_factory.mktemp("checkpoints")
     config = Config(
         model=ModelConfig(coupled_primitives=4, reference_dim=8, residuals=True, width=16, voxel_size=0.1),
-        training=TrainingConfig(steps=40, seed=3, exposure=True),
+        training=TrainingConfig(steps=40, seed=3, exposure=True, averaged=1.0),
     )
     result = {}
     for name, kind in KINDS.items():

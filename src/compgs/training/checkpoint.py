@@ -36,7 +36,7 @@ from compgs.training.restoring import (
 )
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
-CHECKPOINT_VERSION = "7"
+CHECKPOINT_VERSION = "8"
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ from compgs.tensors.prediction import (
 )
 from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
+from compgs.training.averaging import Averaging
 from compgs.training.checkpoint import (
     Checkpoint,
     Writer,
@@ -147,6 +148,7 @@ class Trainer:
         self.model = (model or initial_model(scene, config)).to(device)
         self.scene = local_scene(scene, self.model.world_offset)
         self.optimizer = make_optimizer(self.model, t)
+        self.average = Averaging(self.model)
         self.schedule = make_schedule(config.control, t.steps, views, per_step)
         self.bounds = AnchorBounds(self.model, self.geometry)
         self.control = AdaptiveControl(config, self.schedule, self.shape, device)
@@ -379,8 +381,11 @@ class Trainer:
             if event.due(self.step):
                 event.act()
                 self.bounds.forget()
+                self.average.forget()
                 self.check_ranks()
         self.step += 1
+        if self.progress > 1.0 - self.config.training.averaged:
+            self.average.after_step()
         self.bounds.after_step(self.step)
         self.rate = self.target_size.follow(self.rate, self.step)
         self.choose_head_bits()
@@ -515,7 +520,10 @@ class Trainer:
         return int(size) + fixed_bytes(self.model)
 
     def finish(self) -> None:
-        """Drop coupled primitives that training views hardly see, or not at all, and anchors that have none left."""
+        """The mean of the last steps is the scene; without coupled primitives that training views hardly see, or not at
+        all, and anchors that have none left.
+        """
+        self.average.settle()
         self.bounds.forget()
         everything = self.contributions(most=len(self.scene.train_views))
         self.model.mask = missed(everything, self.config.control.idle_share)
@@ -532,7 +540,7 @@ class Trainer:
     def write(self, path: Path, writer: Writer | None) -> None:
         extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
         extra["chance"] = self.chance.get_state()
-        extra |= self.views.tensors()
+        extra |= self.views.tensors() | self.average.tensors()
         if self.reference_rates is not None:
             extra["reference_rates"] = self.reference_rates
         if self.bounds.measured is not None:
@@ -541,6 +549,7 @@ class Trainer:
             "step": self.step,
             **self.views.state(),
             "rate": asdict(self.rate),
+            "averaged": self.average.steps,
         }
         moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
         save_checkpoint(path, Checkpoint(self.model, moments, extra, state), writer)
@@ -566,6 +575,7 @@ class Trainer:
                 trainer.bounds.measured = bounds.to(device)
             restore_chance(trainer.chance, checkpoint.extra)
             trainer.views.restore(checkpoint.state, checkpoint.extra)
+            trainer.average.restore(checkpoint.state["averaged"], checkpoint.extra)
             trainer.step = checkpoint.state["step"]
             trainer.rate = RateState.restored(checkpoint.state["rate"])
         return trainer
