@@ -501,7 +501,7 @@ class Trainer:
         run_to_end(self, self.config.training, path, on_progress, watch)
 
     def snapshot(self) -> HybridModel:
-        """What the file would hold of the scene now, but for primitives that the end of the run removes."""
+        """What the file would hold of the scene now; the end of the run takes means, and removes primitives."""
         return self.model.as_hybrid_model(stored_weights=self.stored)
 
     @property
