@@ -24,10 +24,21 @@ import numpy as np
 
 from compgs.codec.content import FileContent, GroupShape, Role
 from compgs.codec.fields import FieldReader, varint
-from compgs.codec.format import LATENTS, NETWORKS, SCENE, Section, container_bytes, pack, unpack
+from compgs.codec.format import (
+    FIRST_WITH_DILATION,
+    FIRST_WITH_NEIGHBOURS,
+    LATENTS,
+    NETWORKS,
+    SCENE,
+    Section,
+    container_bytes,
+    pack,
+    unpack,
+    version_of,
+)
 from compgs.codec.latents import read_head
 from compgs.codec.reader import file_info, read_content, read_latents
-from compgs.codec.sections import SCENE_LAYOUT, SEES_COORDINATES, decode_scene
+from compgs.codec.sections import DILATION_LAYOUT, SCENE_LAYOUT, SEES_COORDINATES, decode_scene
 from compgs.codec.writer import write_content
 from compgs.errors import BitstreamError
 
@@ -71,7 +82,8 @@ def forged_header(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
 def spliced(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
     """Some sections from another file."""
     theirs = {section.number: section for section in unpack(other)}
-    return pack([theirs.get(s.number, s) if rng.random() < 0.3 else s for s in unpack(data)])
+    spliced = [theirs.get(s.number, s) if rng.random() < 0.3 else s for s in unpack(data)]
+    return pack(spliced, version_of(data))
 
 
 def forged_payload(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
@@ -92,7 +104,7 @@ def forged_payload(rng: np.random.Generator, data: bytes, other: bytes) -> bytes
             case _:
                 payload += rng.bytes(rng.integers(1, 9))
     sections[i] = Section(sections[i].number, bytes(payload))
-    return pack(sections)
+    return pack(sections, version_of(data))
 
 
 def forged_scene(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
@@ -104,14 +116,15 @@ def forged_scene(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
         place = int(rng.integers(len(payload)))
         payload[place] = rng.choice([0, 1, 2, 64, 127, 128, 254, 255])
     sections[i] = Section(SCENE, bytes(payload))
-    return pack(sections)
+    return pack(sections, version_of(data))
 
 
 def forged_groups(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
     """Groups changed, exchanged, dropped or added, all checksums made right again."""
     sections = unpack(data)
     i = next(i for i, section in enumerate(sections) if section.number == SCENE)
-    scene = decode_scene(sections[i].data, "scene")
+    version = max(FIRST_WITH_NEIGHBOURS, version_of(data))
+    scene = decode_scene(sections[i].data, "scene", version)
     groups = list(scene.dimensions.groups)
     at, to = (int(n) for n in rng.integers(len(groups), size=2))
     match rng.integers(7):
@@ -137,9 +150,10 @@ def forged_groups(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
             odd = [0.0, -1.0, 1.0, float("nan"), float("inf"), 1e-30]
             groups[at] = replace(groups[at], steps=tuple(rng.choice(odd, rng.integers(0, 8))))
     fields = struct.calcsize(SCENE_LAYOUT)
+    fields += struct.calcsize(DILATION_LAYOUT) if version >= FIRST_WITH_DILATION else 0
     described = b"".join(starmap(_described, enumerate(groups)))
     sections[i] = Section(SCENE, sections[i].data[:fields] + varint(len(groups)) + described)
-    return pack(sections)
+    return pack(sections, version)
 
 
 def _described(index: int, shape: GroupShape) -> bytes:
@@ -171,13 +185,13 @@ def forged_range(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
             )
             payload = b"".join(map(varint, fields)) + sections[i].data[reader.position :]
             sections[i] = Section(LATENTS, payload)
-    return pack(sections)
+    return pack(sections, version_of(data))
 
 
 def forged_network(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
     """Flags and widths of networks and of their layers, or their number, changed; all checksums made right again."""
     sections = unpack(data)
-    scene = next(decode_scene(s.data, s.name) for s in sections if s.number == SCENE)
+    scene = next(decode_scene(s.data, s.name, version_of(data)) for s in sections if s.number == SCENE)
     i = next(i for i, section in enumerate(sections) if section.number == NETWORKS)
     reader = FieldReader(sections[i].data, "entropy networks")
     places = []
@@ -199,7 +213,7 @@ def forged_network(rng: np.random.Generator, data: bytes, other: bytes) -> bytes
         place = int(rng.choice(places))
         payload[place] = rng.choice([payload[place] ^ 1 << rng.integers(8), 1, 2, 8, 127])
     sections[i] = Section(NETWORKS, bytes(payload))
-    return pack(sections)
+    return pack(sections, version_of(data))
 
 
 FORGERS = (

@@ -62,6 +62,7 @@ def make_content(
     blocks: int = 0,  # residual blocks of the entropy networks; 0: one linear layer
     hidden: int = 8,  # width of their hidden layers
     symbols: bool = True,  # False: zero symbols, and networks that are sure of it
+    angular_dilation: float | None = None,
 ) -> FileContent:
     """Content whose symbols follow its own networks' predictions, as a trained model's do."""
     d = dimensions or make_dimensions()
@@ -111,6 +112,7 @@ def make_content(
         world_offset=(0.0, 0.0, 0.0),
         view_distance_scale=3.0,
         background=(0.0, 0.5, 1.0),
+        angular_dilation=angular_dilation,
         coordinates=coordinates,
         mask=mask,
         groups=tuple(groups),

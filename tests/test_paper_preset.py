@@ -18,6 +18,8 @@ PUBLISHED = {
     "model.residual_dim": 8,
     "model.residuals": True,
     "model.width": 32,
+    "model.dilation": 0.3,  # of 3DGS, whose rasterizer the paper uses
+    "model.sharp_where_many": 0.0,
     "model.heads": "separate",
     "model.voxel_spacings": 1.0,  # (published: a number for each data set)
     "model.voxel_rate_exponent": 0.0,

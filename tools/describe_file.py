@@ -10,6 +10,7 @@ from pathlib import Path
 
 from compgs.codec.content import FileContent, Role
 from compgs.codec.format import (
+    FIRST_WITH_DILATION,
     HEADS,
     LATENTS,
     MASKS,
@@ -20,6 +21,7 @@ from compgs.codec.format import (
     TABLES,
     container_bytes,
     unpack,
+    version_of,
 )
 from compgs.codec.integer_network import IntegerNetwork
 from compgs.codec.rans import CHUNK_SYMBOLS
@@ -85,8 +87,9 @@ def header(data: bytes) -> Iterator[Row]:
     yield data[container_bytes(data[6]) - 4 : container_bytes(data[6])], "`Header_CRC`"
 
 
-def scene(c: Cursor) -> Iterator[Row]:
-    for name, kind in SCENE_FIELDS:
+def scene(c: Cursor, version: int) -> Iterator[Row]:
+    dilation = (("angular_dilation", "f"),) if version >= FIRST_WITH_DILATION else ()
+    for name, kind in (*SCENE_FIELDS, *dilation):
         raw = c.take(struct.calcsize("<" + kind))
         shown = ", ".join(f"{v:g}" for v in struct.unpack("<" + kind, raw))
         layout = f" ({HEAD_LAYOUTS[raw[0]]})" if name == "heads" else ""
@@ -230,7 +233,7 @@ def rows(data: bytes) -> Iterator[Row]:
     d = content.dimensions
     names = [f"{name} (group {i})" for i, name in enumerate(group_names(d)) if d.groups[i].has_network]
     readers: dict[int, Callable[[Cursor], Iterable[Row]]] = {
-        SCENE: scene,
+        SCENE: lambda c: scene(c, version_of(data)),
         POSITIONS: payload,
         MASKS: payload,
         TABLES: lambda c: tables(c, d.table_count),

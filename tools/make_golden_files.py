@@ -2,8 +2,8 @@
 
     python tools/make_golden_files.py
 
-Run it when the version of the format rises, and only then: golden files of a version decode for ever. (All but
-`neighbours` are of version 2: nothing in them needs a later one.)
+Run it when the version of the format rises, and only then: golden files of a version decode for ever. (`neighbours`
+is of version 3 and `dilated` of version 4; the others are of version 2: nothing in them needs a later one.)
 """
 
 import hashlib
@@ -56,6 +56,13 @@ NEIGHBOUR_GROUPS = (
     GroupShape(Role.LOG_SCALES, 6, DEFAULT_STEPS, (1,)),
 )
 
+# As the default preset has them.
+DILATED_GROUPS = (
+    GroupShape(Role.REFERENCE, 12, (0.33,), sees_neighbours=True),
+    GroupShape(Role.LOG_SCALES, 6, DEFAULT_STEPS, (0,)),
+)
+DILATION = float(np.float32(0.3 / 500**2))
+
 VIEWPOINTS = Viewpoints(
     up=(0.0, -0.6, 0.8),
     views=(
@@ -73,7 +80,8 @@ TRAINED = ("trained",)
 
 def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
     """Content and levels of the ranges, by name: the smallest sensible file, one as the default preset makes it, one as
-    it makes small ones, one as the paper's preset does, one with neighbours, one with everything unusual.
+    it makes small ones, one as the paper's preset does, one with neighbours, one as training writes them, with a
+    dilation, one with everything unusual.
     """
     tiny = make_content(3, 1, make_dimensions(2, paper_groups(2, 0, 1), width=2, residual_dim=2), kept=0.7)
     default = make_content(800, 2, make_dimensions(5, paper_groups(12, 0)))
@@ -85,12 +93,14 @@ def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
         layer.weight[:] = 0
     paper = make_content(60, 4, make_dimensions(10, paper_groups(16, 4)), blocks=2, hidden=12)
     neighbours = make_content(500, 6, make_dimensions(5, NEIGHBOUR_GROUPS))
+    dilated = make_content(90, 7, make_dimensions(5, DILATED_GROUPS), angular_dilation=DILATION)
     made = {
         "tiny": tiny,
         "default": default,
         "constant": constant,
         "paper": paper,
         "neighbours": neighbours,
+        "dilated": dilated,
     }
     return {**{name: (content, None) for name, content in made.items()}, "odd": odd()}
 

@@ -20,7 +20,7 @@ from typing import Any
 GAUSSIAN_TABLES = Path(__file__).parent.parent / "src" / "compgs" / "codec" / "gaussian_tables.bin"
 
 MAGIC = b"\x93CGS"
-VERSION = 3
+VERSION = 4
 OLDEST_VERSION = 2
 OPTIONAL = 0x80
 MAX_SECTIONS = 64
@@ -39,6 +39,7 @@ FREE_NETWORK_PRODUCTS, NETWORK_PRODUCTS_PER_BYTE = 2**28, 2**15
 FREE_HEAD_PRODUCTS, HEAD_PRODUCTS_PER_BYTE = 2**30, 2**17
 MAX_METADATA_BYTES = 4096
 SMALLEST, LARGEST = 2.0**-64, 2.0**64
+SMALLEST_DILATION, LARGEST_DILATION = 2.0**-40, 1.0
 MAX_HYPER_SYMBOLS = 1024
 MAX_LOWEST = 2**18
 MANTISSAS = (1024, 1116, 1217, 1327, 1448, 1579, 1722, 1878)
@@ -199,6 +200,7 @@ class Scene:
     world_offset: tuple[float, float, float]
     view_distance_scale: float
     background: tuple[float, float, float]
+    angular_dilation: float | None
     groups: tuple[Group, ...]
 
     def network_size(self, group: Group) -> tuple[int, int]:
@@ -221,6 +223,9 @@ def read_scene(data: bytes, version: int) -> Scene:
     world_offset = tuple(fields.number("d", -LARGEST, LARGEST, "world_offset") for _ in range(3))
     view_distance_scale = fields.number("d", SMALLEST, LARGEST, "view_distance_scale")
     background = tuple(fields.number("f", -LARGEST, LARGEST, "background") for _ in range(3))
+    dilation = None
+    if version >= 4:
+        dilation = fields.number("f", SMALLEST_DILATION, LARGEST_DILATION, "angular_dilation")
     groups: list[Group] = []
     for _ in range(fields.number("B", 1, MAX_GROUPS, "groups")):
         groups.append(read_group(fields, version, groups, k))
@@ -230,7 +235,7 @@ def read_scene(data: bytes, version: int) -> Scene:
     fields.require(channels[LOG_SCALES] == 6, f"{channels[LOG_SCALES]} log scales, expected 6")
     fields.require(channels[RESIDUAL] in (0, residual_dim), f"{channels[RESIDUAL]} channels of residuals")
     numbers = (anchors, coupled, k, residual_dim, heads, width, voxel_size)
-    return Scene(*numbers, world_offset, view_distance_scale, background, tuple(groups))
+    return Scene(*numbers, world_offset, view_distance_scale, background, dilation, tuple(groups))
 
 
 def read_group(fields: Fields, version: int, before: list[Group], k: int) -> Group:

@@ -73,6 +73,11 @@ class ModelConfig:
     residuals_where_few: Annotated[float, Range(0, 100)] = 0.001
     # the same where views are many and a run passes over them 45 times and more
     residuals_where_many: Annotated[float, Range(0, 100)] = 1e-5
+    # pixels^2 of the training photographs that are added to the variances of what is projected (3DGS); the file keeps
+    # them as an angle, for pictures of other sizes
+    dilation: Annotated[float, Range(0.01, 10)] = 0.3
+    # lambda up to which it is 0.02 instead, where training views are many (23 and more); 0: never (not in the paper)
+    sharp_where_many: Annotated[float, Range(0, 100)] = 0.002
     # hidden width of the residual MLPs (Ref.)
     width: Annotated[int, Range(8, 256, multiple=8)] = 32
     # what reference embeddings are coded around: what anchors around them have that come before in the file (not in

@@ -117,6 +117,7 @@ class TrainedModel(nn.Module):
         self.distance_unit = distance_unit
         self.background = background
         self.world_offset = world_offset
+        self.angular_dilation: float | None = None  # float32, of what is drawn (`RasterSettings`)
         # Cameras of the world that stand for all that the scene was trained on, the first for them best; its sky.
         self.viewpoints: tuple[Camera, ...] = ()
         self.up: tuple[float, float, float] = (0.0, -1.0, 0.0)
@@ -303,6 +304,7 @@ class TrainedModel(nn.Module):
             world_offset=self.world_offset,
             viewpoints=self.viewpoints[: self.config.training.viewpoints],
             up=self.up,
+            angular_dilation=self.angular_dilation,
         )
         return placed(model, self.device)
 

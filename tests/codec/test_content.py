@@ -21,7 +21,7 @@ from compgs.codec.content import (
     dequantize,
     surroundings,
 )
-from compgs.codec.format import MASKS, MAX_SYMBOL, pack, unpack
+from compgs.codec.format import MASKS, MAX_SYMBOL, OLDEST_VERSION, pack, unpack
 from compgs.codec.integer_network import IntegerLayer, IntegerNetwork
 from compgs.codec.reader import file_info, group_names, read_content, read_latents
 from compgs.codec.tables import HyperTable
@@ -371,6 +371,7 @@ def broken(content: FileContent, name: str) -> FileContent:
         "step": lambda: reshaped(2, steps=(0.0,)),
         "steps": lambda: reshaped(2, steps=(1.0,) * 5),
         "steps of a side group": lambda: reshaped(0, steps=(1.0,)),
+        "dilation": lambda: replace(content, angular_dilation=0.0),
         "background": lambda: replace(content, background=(0.0, float("inf"), 0.0)),
         "width": lambda: replace(content, width=0),
         "heads": lambda: replace(content, heads_layout="odd"),
@@ -401,8 +402,8 @@ def broken(content: FileContent, name: str) -> FileContent:
     return changes[name]()
 
 
-BROKEN = """no anchors,shape,dtype,symbol,voxel size,world offset,step,steps,steps of a side group,background,width,
-heads,no groups,no references,log scales,residual dim,residuals as context,too many groups,tables,levels,lowest,
+BROKEN = """no anchors,shape,dtype,symbol,voxel size,world offset,step,steps,steps of a side group,background,dilation,
+width,heads,no groups,no references,log scales,residual dim,residuals as context,too many groups,tables,levels,lowest,
 tables for a network,a network for tables,network size,too many layers,metadata,duplicates,range"""
 
 
@@ -416,7 +417,7 @@ def test_masks_must_agree_with_the_scene_section() -> None:
     a, b = (unpack(write_content(make_content(60, 10, kept=kept))) for kept in (0.2, 0.9))
     mixed = [y if x.number == MASKS else x for x, y in zip(a, b, strict=True)]
     with pytest.raises(CorruptSection, match="masks"):
-        read_content(pack(mixed))
+        read_content(pack(mixed, OLDEST_VERSION))
 
 
 def test_the_origin_of_the_world_comes_back_to_the_last_bit() -> None:

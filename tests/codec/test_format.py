@@ -17,6 +17,7 @@ from compgs.codec.format import (
     POSITIONS_GPCC,
     REQUIRED,
     SECTION_NAMES,
+    VERSION,
     Section,
     container_bytes,
     pack,
@@ -32,7 +33,7 @@ PRESENT = sorted((*REQUIRED, POSITIONS))  # sections of the smallest file
 
 
 def some_file(extra: list[Section] | None = None) -> bytes:
-    return pack([Section(n, bytes([n]) * (n * 3)) for n in PRESENT] + (extra or []))
+    return pack([Section(n, bytes([n]) * (n * 3)) for n in PRESENT] + (extra or []), VERSION)
 
 
 def with_header(data: bytes, **changes: int) -> bytes:
@@ -85,7 +86,7 @@ def test_truncation_names_the_section() -> None:
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"version": 4}, UnsupportedVersion, "version 4.*newer compgs"),
+        ({"version": 5}, UnsupportedVersion, "version 5.*newer compgs"),
         ({"version": 1}, UnsupportedVersion, "version 1.*encode the scene again"),
         ({"version": 0}, UnsupportedVersion, "version 0"),
         ({"flags": 1}, CorruptSection, "flags"),
@@ -107,11 +108,11 @@ def test_absurd_headers_are_refused(
 
 def test_missing_and_left_over_parts_are_refused() -> None:
     with pytest.raises(CorruptSection, match="'latents' is missing"):
-        unpack(pack([Section(n, b"") for n in PRESENT[:-1]]))
+        unpack(pack([Section(n, b"") for n in PRESENT[:-1]], VERSION))
     with pytest.raises(CorruptSection, match="3 bytes are left over"):
         unpack(some_file() + b"abc")
     with pytest.raises(CorruptSection, match="64"):
-        unpack(pack([Section(128 + n, b"") for n in range(65)]))
+        unpack(pack([Section(128 + n, b"") for n in range(65)], VERSION))
 
 
 def test_every_flipped_bit_is_caught() -> None:
@@ -137,7 +138,7 @@ RANGES = [Section(LATENTS, b"coarse"), Section(LATENTS, b"finer"), Section(LATEN
 def file_of_ranges() -> bytes:
     """Latents in three sections, metadata between two of them."""
     others = [Section(n, bytes([n]) * 5) for n in PRESENT if n != LATENTS]
-    return pack([*others, *RANGES[:2], Section(METADATA, b"who"), RANGES[2]])
+    return pack([*others, *RANGES[:2], Section(METADATA, b"who"), RANGES[2]], VERSION)
 
 
 def test_only_latents_may_come_in_several_sections() -> None:
@@ -147,11 +148,11 @@ def test_only_latents_may_come_in_several_sections() -> None:
             continue
         twice = sorted([*PRESENT, number, METADATA])
         with pytest.raises(CorruptSection, match="ascending order, each once"):
-            unpack(pack([Section(n, b"") for n in twice]))
+            unpack(pack([Section(n, b"") for n in twice], VERSION))
     many = [Section(n, b"") for n in PRESENT] + [Section(LATENTS, b"")] * MAX_RANGES
-    assert len(unpack(pack(many[:-1]))) == len(many) - 1
+    assert len(unpack(pack(many[:-1], VERSION))) == len(many) - 1
     with pytest.raises(CorruptSection, match=f"{MAX_RANGES + 1} ranges, expected at most {MAX_RANGES}"):
-        unpack(pack(many))
+        unpack(pack(many, VERSION))
 
 
 def test_a_beginning_of_a_file_has_the_sections_that_are_whole() -> None:
@@ -216,5 +217,5 @@ def test_document_names_every_section_with_its_number() -> None:
 def test_positions_come_in_exactly_one_section() -> None:
     for numbers in (REQUIRED, sorted((*PRESENT, POSITIONS_GPCC))):
         with pytest.raises(CorruptSection, match="one section of positions"):
-            unpack(pack([Section(n, b"") for n in numbers]))
-    unpack(pack([Section(n, b"") for n in sorted((*REQUIRED, POSITIONS_GPCC))]))
+            unpack(pack([Section(n, b"") for n in numbers], VERSION))
+    unpack(pack([Section(n, b"") for n in sorted((*REQUIRED, POSITIONS_GPCC))], VERSION))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from compgs.codec.fields import FieldReader, varint
-from compgs.codec.format import LATENTS, SCENE, Section, pack, unpack
+from compgs.codec.format import LATENTS, OLDEST_VERSION, SCENE, Section, pack, unpack
 from compgs.codec.latents import read_head
 from compgs.codec.reader import read_content, read_latents
 from compgs.codec.sections import SCENE_LAYOUT
@@ -81,7 +81,7 @@ def test_memory_stays_proportional_to_the_file(anchors: int, coupled: int, prefi
     head = read_head(reader)
     forged = bytes([head.level]) + varint(anchors) + varint(anchors * coupled)
     sections[at] = Section(LATENTS, forged + sections[at].data[reader.position :])
-    data = pack(sections)
+    data = pack(sections, OLDEST_VERSION)
     tracemalloc.start()
     try:
         with pytest.raises(CorruptSection):

@@ -46,13 +46,15 @@ def test_the_golden_files_are_those_that_the_tool_makes() -> None:
 def test_golden_files_show_what_the_format_has() -> None:
     """Between them: every role with a network and with tables; several groups of a role; coordinates and neighbours as
     context, with latents and alone; residual blocks, linear layers and skips; one step a group and one a channel;
-    several ranges and one; both layouts of the heads, and residual embeddings there; extreme symbols; a moved origin.
+    several ranges and one; both layouts of the heads, and residual embeddings there; extreme symbols; a moved origin;
+    an angular dilation and none.
     """
     features: set[object] = set()
     for name in PINNED:
         data = (GOLDEN / f"{name}.cgs").read_bytes()
         content = read_latents(data)[0]
         features.add(("version", file_info(data).version))
+        features.add(("dilation", content.angular_dilation is not None))
         features |= {content.heads_layout, ("ranges", len(file_info(data).ranges))}
         features |= {("moved", any(content.world_offset)), *(name for name, _ in content.heads)}
         for role in Role:
@@ -73,6 +75,7 @@ def test_golden_files_show_what_the_format_has() -> None:
     expected |= {(role, "groups", count) for role, count in several.items()} | {(Role.RESIDUAL, "groups", 0)}
     expected |= {("coordinates", True, True), ("coordinates", True, False), ("coordinates", False, True)}
     expected |= {("neighbours", True, True), ("neighbours", True, False), ("version", 2), ("version", 3)}
+    expected |= {("version", 4), ("dilation", True), ("dilation", False)}
     expected |= {("steps", 1, True), ("steps", 2, True)}
     expected |= {("layers", 1, False), ("layers", 4, True), ("layers", 6, True)}
     assert expected <= features

@@ -123,9 +123,10 @@ def test_a_beginning_without_a_range_is_refused_by_the_name_of_what_is_missing(c
 def test_a_file_whose_last_range_is_missing_is_refused_as_a_beginning_too(content: FileContent) -> None:
     """All that its header names has arrived, and still it does not reach the octree's depth."""
     levels = allowed_levels(content)
-    sections = unpack(write_content(content, levels=levels))
+    data = write_content(content, levels=levels)
+    sections = unpack(data)
     last = max(i for i, section in enumerate(sections) if section.number == LATENTS)
-    shorter = pack(sections[:last] + sections[last + 1 :])
+    shorter = pack(sections[:last] + sections[last + 1 :], version_of(data))
     for prefix in (False, True):
         with pytest.raises(CorruptSection, match="latents: the last level is"):
             read_latents(shorter, prefix=prefix)
@@ -173,21 +174,23 @@ def test_forged_heads_of_ranges_are_refused(
 
 
 def test_ranges_in_another_order_are_refused(content: FileContent) -> None:
-    sections = unpack(write_content(content, levels=allowed_levels(content)))
+    data = write_content(content, levels=allowed_levels(content))
+    sections = unpack(data)
     ranges = [i for i, section in enumerate(sections) if section.number == LATENTS]
     sections[ranges[1]], sections[ranges[2]] = sections[ranges[2]], sections[ranges[1]]
     for prefix in (False, True):
         with pytest.raises(CorruptSection, match=r"latents: levels are .*ascending"):
-            read_latents(pack(sections), prefix=prefix)
+            read_latents(pack(sections, version_of(data)), prefix=prefix)
 
 
 def test_a_range_that_another_scene_follows_is_refused(content: FileContent) -> None:
     """Bytes behind the last group of a range."""
-    sections = unpack(write_content(content))
+    data = write_content(content)
+    sections = unpack(data)
     at = next(i for i, section in enumerate(sections) if section.number == LATENTS)
     sections[at] = Section(LATENTS, sections[at].data + b"\0")
     with pytest.raises(CorruptSection, match="latents: 1 bytes are left over"):
-        read_content(pack(sections))
+        read_content(pack(sections, version_of(data)))
 
 
 @pytest.mark.parametrize(

@@ -17,11 +17,13 @@ from compgs.codec.format import (
     FREE_SYMBOLS,
     HEAD_PRODUCTS_PER_BYTE,
     NETWORK_PRODUCTS_PER_BYTE,
+    OLDEST_VERSION,
     PADDING,
     SYMBOLS_PER_BYTE,
     Section,
     pack,
     unpack,
+    version_of,
 )
 from compgs.codec.integer_network import IntegerLayer, IntegerNetwork
 from compgs.codec.limits import HEAD_PRODUCTS, NETWORK_PRODUCTS, SYMBOLS, Limit, check_amount, least_bytes
@@ -63,7 +65,7 @@ def idle_scene(anchors: int, *, network: bool = False, heads: bool = False) -> F
 
 
 def without_padding(data: bytes) -> bytes:
-    return pack([section for section in unpack(data) if section.number != PADDING])
+    return pack([section for section in unpack(data) if section.number != PADDING], version_of(data))
 
 
 @pytest.mark.parametrize(
@@ -120,10 +122,10 @@ def test_a_scene_of_many_symbols_is_padded_so_that_it_and_its_beginnings_can_be_
 
 def test_padding_is_zeros() -> None:
     sections = [*unpack(write_content(make_content(5, 0))), Section(PADDING, bytes(10))]
-    assert len(read_content(pack(sections)).coordinates) == 5
+    assert len(read_content(pack(sections, OLDEST_VERSION)).coordinates) == 5
     sections[-1] = Section(PADDING, bytes(9) + b"\1")
     with pytest.raises(CorruptSection, match="padding"):
-        read_content(pack(sections))
+        read_content(pack(sections, OLDEST_VERSION))
 
 
 def test_a_made_scene_needs_no_padding() -> None:

@@ -78,7 +78,14 @@ def assert_same(found: dict, content: FileContent, latents: tuple[np.ndarray, ..
         assert same(ours["symbols"], group.symbols) and same(ours["latents"], rows)
     scene = found["scene"]
     assert ("separate", "paired")[scene["heads"]] == content.heads_layout
-    for name in ("coupled_primitives", "residual_dim", "width", "voxel_size", "view_distance_scale"):
+    for name in (
+        "coupled_primitives",
+        "residual_dim",
+        "width",
+        "voxel_size",
+        "view_distance_scale",
+        "angular_dilation",
+    ):
         assert scene[name] == getattr(content, name), name
     for name in ("world_offset", "background"):
         assert tuple(scene[name]) == tuple(getattr(content, name)), name

@@ -22,15 +22,16 @@ from compgs.formats.tiled import Core, GroundAxes, read_manifest
 from compgs.formats.tiled_scene import ASKED_BY, TileCache, TiledScene, resident_bytes, tile_memory
 from compgs.formats.tiled_writer import NewTile, _counted_from, common_offset, spheres, write_tiles
 from compgs.gaussians import Gaussians
-from compgs.render import RasterSettings, Renderable, rasterize, render
+from compgs.render import RasterSettings, Renderable, rasterize, render, settings_of
 
 APART = 8.0  # world units between the middles of two tiles
+DILATION = 2.0**-12  # at cameras of 60 pixels: three times what is added without one
 AT = ((0.0, 0.0, 0.0), (APART, 0.0, 0.0), (0.0, APART, 0.0), (APART, APART, 0.0))
 
 
 def placed_at(data: bytes, offset: tuple[float, float, float]) -> bytes:
     """The same scene somewhere else."""
-    return write_content(replace(read_content(data), world_offset=offset))
+    return write_content(replace(read_content(data), world_offset=offset, angular_dilation=DILATION))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +66,7 @@ def together(contents: list[bytes], camera: Camera, offset: np.ndarray, tmp_path
         seen = model.gaussians(camera.moved(model.world_offset))
         rows.append(vars(replace(seen, means=seen.means + shift.astype(np.float32))).values())
     every = Gaussians(*(np.concatenate(arrays) for arrays in zip(*rows, strict=True)))
-    settings = RasterSettings(background=(0.1, 0.2, 0.3))
+    settings = RasterSettings(background=(0.1, 0.2, 0.3), angular_dilation=DILATION)
     return rasterize(every, camera.moved(offset), settings).image
 
 
@@ -213,6 +214,10 @@ def test_a_manifest_is_read_as_it_was_written(folder: Path, contents: list[bytes
     assert manifest.ground == ground and manifest.tiles[0].core == core
     assert manifest.tiles[0].sha256 == hashlib.sha256(contents[0]).hexdigest()
     assert len(manifest.viewpoints) == len(open_scene(tmp_path / "x.tiles" / "a.cgs").viewpoints) > 0
+    dilation = open_scene(tmp_path / "x.tiles" / "a.cgs").angular_dilation
+    assert (
+        open_scene(tmp_path / "x.tiles").angular_dilation == manifest.angular_dilation == dilation is not None
+    )
     four = read_manifest(folder / "manifest.json")
     assert len(four.viewpoints) == 12
     np.testing.assert_allclose(four.up, open_scene(folder / "0_0.cgs").up, atol=1e-12)
@@ -262,12 +267,13 @@ def test_a_manifest_that_was_changed_anywhere_is_refused(copy: Path) -> None:
             open_scene(copy)
 
 
-def forged(copy: Path, **changes: object) -> None:
-    """The first tile's entry is changed, and the checksum is made to match."""
+def forged(copy: Path, whole: dict[str, object] | None = None, **changes: object) -> None:
+    """The first tile's entry, or what stands beside the tiles, is changed, and the checksum is made to match."""
     path = copy / "manifest.json"
     content = json.loads(path.read_text())
     rest = {k: v for k, v in content.items() if k not in ("format", "version", "checksum")}
     rest["tiles"][0] |= changes
+    rest |= whole or {}
     text = json.dumps(rest, sort_keys=True, separators=(",", ":"))
     head = {"format": "compgs tiles", "version": 1, "checksum": hashlib.sha256(text.encode()).hexdigest()}
     path.write_text(json.dumps(head | rest))
@@ -298,6 +304,24 @@ def test_a_manifest_of_nonsense_is_refused_also_where_its_checksum_matches(
     forged(copy, **changes)
     with pytest.raises(CorruptSection, match="manifest is damaged"):
         open_scene(copy)
+
+
+@pytest.mark.parametrize("value", [0.0, -1, 2.0, "0.1", True, [0.1]])
+def test_a_dilation_that_cannot_be_is_refused(copy: Path, value: object) -> None:
+    forged(copy, {"angular_dilation": 1e-6})
+    assert open_scene(copy).angular_dilation == 1e-6
+    forged(copy, {"angular_dilation": value})
+    with pytest.raises(CorruptSection, match="manifest is damaged"):
+        open_scene(copy)
+
+
+def test_a_manifest_without_a_dilation_is_drawn_as_before_there_was_one(copy: Path) -> None:
+    path = copy / "manifest.json"
+    rest = json.loads(path.read_text())
+    del rest["angular_dilation"]
+    path.write_text(json.dumps(rest))
+    forged(copy)
+    assert open_scene(copy).angular_dilation is None
 
 
 @pytest.mark.parametrize(
@@ -378,7 +402,7 @@ def test_how_much_memory_tiles_may_take_is_said_by_the_environment(monkeypatch: 
 def test_another_device_draws_the_gaussians_of_all_tiles(folder: Path, cameras: list[Camera]) -> None:
     model = open_tiles(folder / "manifest.json")
     local = cameras[0].moved(model.world_offset)
-    settings = RasterSettings(background=model.background)
+    settings = settings_of(model)
     found = drawn(model.gaussians(local), local, settings, str(torch.device("cpu")))
     np.testing.assert_allclose(found.image, render(model, cameras[0]).image, atol=2e-5)
     mixed = model.blended(model.gaussians(local), local, settings)

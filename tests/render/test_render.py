@@ -33,6 +33,7 @@ class PlainModel:
     """Draws the same fifty Gaussians wherever it is looked at from."""
 
     background = (0.1, 0.6, 0.3)
+    angular_dilation: float | None = None
     world_offset = (0.0, 0.0, 0.0)
     bounds = (np.array([[0.0, 0, 3], [0, 0, -3]], np.float32), np.array([0.7, 0.7], np.float32))
     counts: ClassVar = {"splats": 50}
@@ -78,6 +79,41 @@ def test_settings_replace_the_defaults():
     assert np.all(result.image == 1)
 
 
+def test_an_angular_dilation_is_that_of_the_training_at_every_size_but_for_the_smallest():
+    settings = RasterSettings(angular_dilation=0.3 / 30**2)
+    for scale, pixels in ((1, 0.3), (2, 1.2), (0.5, 0.075), (0.1, 0.02)):
+        camera = Camera(np.eye(4), 30.0 * scale, 30.0 * scale, 10.0, 8.0, 20, 16)
+        assert settings.dilation_of(camera) == pytest.approx(pixels)
+        assert RasterSettings(dilation=0.7).dilation_of(camera) == 0.7
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_a_scene_with_an_angular_dilation_looks_larger_as_it_looks_small(size: int):
+    """A larger picture, reduced, is the smaller one; with pixels it is sharper and paler."""
+    thin = Gaussians(
+        np.array([[0.0, 0, 3], [0.3, 0.2, 3]], np.float32), np.array([[1.0, 0, 0, 0]] * 2, np.float32),
+        np.full((2, 3), 0.005, np.float32), np.array([0.9, 0.9], np.float32), np.ones((2, 3), np.float32),
+    )  # fmt: skip
+
+    class Thin(PlainModel):
+        background = (0.0, 0.0, 0.0)
+
+        def gaussians(self, camera: Camera, visible: np.ndarray | None = None) -> Gaussians[np.ndarray]:
+            return thin
+
+    large = Camera(np.eye(4), 30.0 * size, 30.0 * size, 10.0 * size, 8.0 * size, 20 * size, 16 * size)
+
+    def away(model: PlainModel) -> float:
+        small, big = render(model, CAMERA).image, render(model, large).image
+        reduced = big.reshape(16, size, 20, size, 3).mean((1, 3))
+        return float(np.abs(reduced - small).sum() / small.sum())
+
+    fixed, angular = Thin(), Thin()
+    angular.angular_dilation = 1.0 / 30**2
+    assert away(angular) < 0.1
+    assert away(fixed) > 0.5
+
+
 def test_a_model_is_asked_for_anchors_in_view_only():
     model = PlainModel()
     render(model, CAMERA)
@@ -113,7 +149,9 @@ def test_settings_that_gsplat_cannot_obey_are_refused():
         {"transmittance_stop": 1e-3},
         {"margin": 0.15},
     ):
-        with pytest.raises(ConfigError, match="on CUDA only background, dilation, near_plane"):
+        with pytest.raises(
+            ConfigError, match="on CUDA only angular_dilation, background, dilation, near_plane"
+        ):
             check_settings(dataclasses.replace(RasterSettings(), **change))
 
 

@@ -43,6 +43,7 @@ def test_where_to_look_from_and_which_way_is_up_come_back(blob_scene, tiny_confi
     trainer = Trainer(blob_scene, tiny_config, CPU, model)
     trainer.save(path)
     again = load_checkpoint(path).model
+    assert again.angular_dilation == model.angular_dilation is not None
     assert again.up == (0.0, 0.6, 0.8)
     assert len(again.viewpoints) == len(model.viewpoints) > 0
     for mine, theirs in zip(model.viewpoints, again.viewpoints, strict=True):

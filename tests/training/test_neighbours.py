@@ -69,7 +69,7 @@ def test_what_was_trained_is_what_the_file_decodes_to(trained: Trainer, tmp_path
     """Anchor by anchor: neighbours change what a latent costs, and not what it is."""
     encode(trained.model, tmp_path / "a.cgs")
     info = file_info((tmp_path / "a.cgs").read_bytes())
-    assert info.version == 3 and len(info.ranges) > 1
+    assert info.version == 4 and len(info.ranges) > 1
     mine, theirs = trained.model.as_hybrid_model().primitives, decode(tmp_path / "a.cgs").primitives
     rows = {tuple(p): i for i, p in enumerate(mine.positions.tolist())}
     order = [rows[tuple(p)] for p in theirs.positions.tolist()]

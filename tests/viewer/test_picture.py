@@ -11,6 +11,9 @@ import compgs
 from compgs.cameras import Camera
 from compgs.codec.content import FileContent
 from compgs.codec.writer import write_content
+from compgs.metrics import to_8bit
+from compgs.model.hybrid_model import HybridModel
+from compgs.render import RasterSettings
 from compgs.viewer import html_page
 
 from .headless import visit
@@ -27,6 +30,10 @@ CONTENTS = {
     "paired": make_content(400, 3, SHARED),
     "separate": make_content(400, 4, SEPARATE),
     "far away": replace(make_content(400, 5, SHARED), world_offset=(4.5e6, -2.25e5, 1.0)),
+    # 5.9 pixels^2 in the larger pictures of `cameras_around`, 0.23 in the smallest; a file without has 0.3 in all.
+    "dilated": make_content(400, 3, SHARED, angular_dilation=2.0**-12),
+    # The least, 0.02 pixels^2, in all.
+    "hardly dilated": make_content(400, 7, SHARED, angular_dilation=2.0**-26),
 }
 
 
@@ -35,14 +42,18 @@ def written(content: FileContent) -> bytes:
     return write_content(replace(content, heads=heads))
 
 
+def decoded(content: FileContent, folder: Path) -> HybridModel:
+    (folder / "scene.cgs").write_bytes(written(content))
+    return compgs.decode(folder / "scene.cgs")
+
+
 def cameras_around(content: FileContent) -> list[Camera]:
-    """Two: one beside the scene, one within it, their principal points off the middle."""
+    """Beside the scene, within it, and beside it in a small picture; their principal points are off the middle."""
     middle = content.coordinates.mean(0) * content.voxel_size + np.array(content.world_offset)
     extent = float(np.ptp(content.coordinates, axis=0).max()) * content.voxel_size
-    return [
-        _looking(middle + extent * np.array((0.4, -0.5, -1.1)), middle),
-        _looking(middle + extent * np.array((0.05, 0.1, 0.0)), middle + extent),
-    ]
+    beside = _looking(middle + extent * np.array((0.4, -0.5, -1.1)), middle)
+    within = _looking(middle + extent * np.array((0.05, 0.1, 0.0)), middle + extent)
+    return [beside, within, beside.resized(40, 28)]
 
 
 def _looking(centre: np.ndarray, target: np.ndarray) -> Camera:
@@ -59,15 +70,30 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255.0**2 / max(((a.astype(float) - b.astype(float)) ** 2).mean(), 1e-9)))
 
 
+@pytest.mark.parametrize(
+    ("name", "camera", "wrong"),
+    [
+        ("dilated", 0, 0.3),  # that of a file without
+        ("dilated", 2, 5.9),  # the same pixels in every size
+        ("hardly dilated", 0, 0.3),
+        ("hardly dilated", 2, 2.0**-26 * 30 * 32),  # no least
+    ],
+)
+def test_another_dilation_would_be_seen(name: str, camera: int, wrong: float, tmp_path: Path) -> None:
+    model = decoded(CONTENTS[name], tmp_path)
+    seen_from = cameras_around(CONTENTS[name])[camera]
+    wrongly = RasterSettings(background=model.background, dilation=wrong)
+    expected, found = (compgs.render(model, seen_from, s).image for s in (None, wrongly))
+    assert psnr(to_8bit(found), to_8bit(expected)) < LEAST_DB - 5
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CONTENTS)
 def test_the_page_shows_what_the_renderer_does(name: str, browser: str, tmp_path: Path) -> None:
     content = CONTENTS[name]
-    data = written(content)
-    (tmp_path / "scene.cgs").write_bytes(data)
-    model = compgs.decode(tmp_path / "scene.cgs")
+    model = decoded(content, tmp_path)
     cameras = cameras_around(content)
-    seen = visit(browser, tmp_path / "browser", html_page(data, name), cameras)
+    seen = visit(browser, tmp_path / "browser", html_page(written(content), name), cameras)
     assert seen.error == ": " and len(seen.pictures) == len(cameras)
     for picture, camera in zip(seen.pictures, cameras, strict=True):
         image = compgs.render(model, camera).image

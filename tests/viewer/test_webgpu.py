@@ -97,7 +97,8 @@ def webgpu(browser: str, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
-    return from_three_cameras(CONTENTS["paired"], tmp_path_factory.mktemp("scene"))
+    """With an angular dilation, which is other pixels for each camera, also where one renderer follows on another."""
+    return from_three_cameras(CONTENTS["dilated"], tmp_path_factory.mktemp("scene"))
 
 
 def from_three_cameras(content: FileContent, folder: Path) -> Shown:
@@ -105,7 +106,7 @@ def from_three_cameras(content: FileContent, folder: Path) -> Shown:
     data = written(content)
     (folder / "scene.cgs").write_bytes(data)
     model = compgs.decode(folder / "scene.cgs")
-    outside, _ = cameras_around(content)
+    outside = cameras_around(content)[0]
     positions = content.coordinates * content.voxel_size
     anchor = positions[np.argmin(np.linalg.norm(positions - positions.mean(0), axis=1))]
     within = looking(anchor, anchor + 7.0)

@@ -54,6 +54,7 @@ for (const { name, bytes, expected } of fixtures()) {
     assert.equal(scene.voxelSize, expected.voxel_size);
     assert.deepEqual(scene.worldOffset, expected.world_offset);
     assert.deepEqual(scene.background, expected.background);
+    assert.equal(scene.angularDilation, expected.angular_dilation);
     assert.deepEqual(Object.fromEntries(scene.metadata), expected.metadata);
     assert.equal(scene.standsFor, null);
     assertViewpoints(scene.viewpoints, expected.viewpoints);

@@ -8,6 +8,8 @@ import { compgs, goldenFiles, hashesOf } from "./fixtures.mjs";
 const { Predictor, decode } = compgs;
 const [SCENE, POSITIONS, GPCC, MASKS, HEADS, LATENTS] = [1, 2, 3, 4, 7, 8];
 const [REFERENCE, RESIDUAL] = [1, 3];
+/** Where the background of a scene section ends. The groups follow, from version 4 on after the angular dilation. */
+const BACKGROUND_END = 65;
 const [METADATA, PADDING, VIEWPOINTS, UNKNOWN] = [129, 130, 131, 200];
 /** One lens of 4 x 3 pixels, one view, of which `rotation` is six bytes. */
 const viewpoints = (rotation) => {
@@ -47,10 +49,10 @@ function fileOf(sections, version = files[0].bytes[4]) {
   return Buffer.concat([head, check, ...sections.map(({ payload }) => payload)]);
 }
 
-/** Of each group that a scene section describes, its role and where its context is. */
+/** Of each group that a scene section of version 2 or 3 describes, its role and where its context is. */
 function groupsOf(scene) {
-  let at = 66;
-  return Array.from({ length: scene[65] }, () => {
+  let at = BACKGROUND_END + 1;
+  return Array.from({ length: scene[BACKGROUND_END] }, () => {
     const [role, context, steps] = [scene[at], at + 2, scene[at + 3]];
     at += 4 + 4 * steps;
     return { role, context };
@@ -65,6 +67,9 @@ const original = sectionsOf(files[0].bytes);
 // A file of version 2 with each role.
 const { bytes: paperBytes, hashes: paperHashes } = goldenFiles().find(({ name }) => name === "paper");
 const paper = sectionsOf(paperBytes);
+// A file of version 4.
+const { bytes: dilatedBytes, hashes: dilatedHashes } = goldenFiles().find(({ name }) => name === "dilated");
+const dilated = sectionsOf(dilatedBytes);
 const without = (number) => original.filter((section) => section.number !== number);
 const withOne = (number, payload) => [...without(number), { number, payload: Buffer.from(payload) }];
 const refuses = (sections, name, message, options) =>
@@ -77,11 +82,12 @@ test("what was taken apart is put together as it was", () => {
   assert.deepEqual(fileOf(original), Buffer.from(files[0].bytes));
 });
 
-test("a file is of version 2 or 3", () => {
+test("a file is of version 2, 3 or 4", () => {
   for (const version of [2, 3]) {
     assert.deepEqual(hashesOf(decode(fileOf(paper, version))), paperHashes);
   }
-  for (const version of [0, 1, 4, 255]) {
+  assert.deepEqual(hashesOf(decode(fileOf(dilated, 4))), dilatedHashes);
+  for (const version of [0, 1, 5, 255]) {
     assert.throws(() => decode(fileOf(paper, version)), { name: "UnsupportedVersion" });
   }
 });
@@ -101,6 +107,30 @@ test("neighbours are of version 3, and not of residuals", () => {
   refusesContext(REFERENCE, 3, /^entropy networks/); // its network has too few weights
   refusesContext(RESIDUAL, 2, /^scene: context of group/);
   refusesContext(RESIDUAL, 3, /^scene: .* residuals/);
+});
+
+test("an angular dilation is of version 4, where it must be, and within its limits", () => {
+  for (const { bytes } of goldenFiles()) assert.equal(decode(bytes).angularDilation === null, bytes[4] < 4);
+  assert.equal(decode(dilatedBytes).angularDilation, Math.fround(0.3 / 500 ** 2));
+  const withDilation = (value) => {
+    const scene = Buffer.from(dilated[0].payload);
+    scene.writeFloatLE(value, BACKGROUND_END);
+    return fileOf([{ number: SCENE, payload: scene }, ...dilated.slice(1)], 4);
+  };
+  for (const value of [2 ** -40, 1]) assert.equal(decode(withDilation(value)).angularDilation, value);
+  for (const value of [0, -1, 2 ** -41, 1.001, Infinity, NaN]) {
+    assert.throws(
+      () => decode(withDilation(value)),
+      (thrown) => thrown.name === "CorruptSection" && /^scene: angular_dilation/.test(thrown.message),
+    );
+  }
+  const refusesAs = (sections, version) =>
+    assert.throws(
+      () => decode(fileOf(sections, version)),
+      (thrown) => thrown.name === "CorruptSection" && /^scene: /.test(thrown.message),
+    );
+  for (const version of [2, 3]) refusesAs(dilated, version);
+  refusesAs(paper, 4);
 });
 
 test("ranges that leave anchors out are refused, as a whole file and as a beginning that has all its ranges", () => {

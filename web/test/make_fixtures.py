@@ -83,6 +83,7 @@ def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
     }
     near = make_dimensions(3, NEIGHBOURS, width=16)
     made["neighbours"] = (make_content(600, 13, near, kept=0.5, blocks=1), EVERY_LEVEL)
+    made["dilated"] = (make_content(300, 15, near, kept=0.5, angular_dilation=2.0**-18), EVERY_LEVEL)
     wild = make_content(900, 14, near, kept=0.5)
     for group in wild.groups:
         group.symbols[::7] *= 900  # beyond what a network takes
@@ -157,6 +158,7 @@ def expected(data: bytes) -> tuple[dict[str, Any], bytes]:
         "voxel_size": content.voxel_size,
         "world_offset": list(content.world_offset),
         "background": list(content.background),
+        "angular_dilation": content.angular_dilation,
         "metadata": content.metadata,
         "viewpoints": None
         if views is None
@@ -225,7 +227,7 @@ def _damage_payload(data: bytearray, rng: np.random.Generator) -> None:
         entry = 7 + 9 * i
         length = int.from_bytes(data[entry + 1 : entry + 5], "little")
         if i == chosen and length:
-            at = start + int(rng.integers(0, min(length, 60)))
+            at = start + int(rng.integers(0, min(length, 80)))
             data[at] = int(rng.integers(0, 256))
             data[entry + 5 : entry + 9] = zlib.crc32(data[start : start + length]).to_bytes(4, "little")
         start += length

@@ -23,6 +23,7 @@ for (const { name, bytes, hashes } of goldenFiles()) {
         const expected = decode(bytes, { prefix: arrived });
         assert.deepEqual(hashesOf(decoder.scene()), hashesOf(expected));
         assert.deepEqual(decoder.scene().standsFor, expected.standsFor);
+        assert.equal(decoder.scene().angularDilation, expected.angularDilation);
       }
       decoder.finish();
       assert.equal(decoder.expectedBytes, bytes.length);

@@ -24,6 +24,7 @@ export interface SceneInfo {
   totalAnchors: number;
   coupled: number;
   background: [number, number, number];
+  angularDilation: number | null;
   worldOffset: [number, number, number];
   viewpoints: Viewpoints | null;
   /** Middle and half extent of most anchors. */

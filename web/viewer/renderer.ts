@@ -21,6 +21,8 @@ export interface Renderer {
   readonly lost: Promise<string>;
   /** Red, green, blue; display values 0 to 1 */
   background: [number, number, number];
+  /** As the scene has it. */
+  angularDilation: number | null;
   /**
    * New splats, of which none is drawn yet.
    *

@@ -143,7 +143,7 @@ export class Viewer {
     this.stage.replaceChildren(renderer.canvas);
     this.renderer = renderer;
     this.hasSplats = false;
-    if (this.info) renderer.background = this.info.background;
+    if (this.info) setScene(renderer, this.info);
     void renderer.lost.then((reason) => {
       if (this.renderer === renderer) void this.replace(renderer, reason);
     });
@@ -180,7 +180,7 @@ export class Viewer {
     else if (message.kind === "error") options.onError?.(message.name, message.message);
     else if (message.kind === "scene") {
       this.info = message.info;
-      if (renderer) renderer.background = message.info.background;
+      if (renderer) setScene(renderer, message.info);
       this.controls.target ??= startOf(message.info, this.view);
       if (!this.isTouched) this.goTo(this.view);
       else this.changed();
@@ -263,6 +263,12 @@ export class Viewer {
       cy: height / 2,
     };
   }
+}
+
+/** Tells a renderer what is not of single splats. */
+function setScene(renderer: Renderer, { background, angularDilation }: SceneInfo): void {
+  renderer.background = background;
+  renderer.angularDilation = angularDilation;
 }
 
 /** A camera of the world in the local frame: t + R offset, in 64-bit floats. */

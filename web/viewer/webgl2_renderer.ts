@@ -1,7 +1,7 @@
 /** Draws splats with WebGL2. Sums are kept in 16-bit floats where the browser can: 8 bits lose faint splats. */
 
 import { CannotDraw, type FrameCamera, type Renderer, tooManySplats } from "./renderer.ts";
-import { PLANES, ROW } from "./splatting.ts";
+import { PLANES, ROW, dilationOf } from "./splatting.ts";
 import { SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX } from "./webgl2_shaders.ts";
 
 export class WebGL2Renderer implements Renderer {
@@ -9,6 +9,7 @@ export class WebGL2Renderer implements Renderer {
   readonly canvas = document.createElement("canvas");
   readonly lost: Promise<string>;
   background: [number, number, number] = [0, 0, 0];
+  angularDilation: number | null = null;
   private readonly gl: WebGL2RenderingContext;
   private readonly splats: WebGLProgram;
   private readonly screen: WebGLProgram;
@@ -111,6 +112,7 @@ export class WebGL2Renderer implements Renderer {
     gl.uniform2f(this.at(splats, "focal"), camera.fx, camera.fy);
     gl.uniform2f(this.at(splats, "principal"), camera.cx, camera.cy);
     gl.uniform2f(this.at(splats, "size"), width, height);
+    gl.uniform1f(this.at(splats, "dilation"), dilationOf(this.angularDilation, camera));
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.vertices);

@@ -1,6 +1,6 @@
 /** Splats as docs/bitstream_prediction.md, "Rendering", has them: one quad each, drawn from back to front. */
 
-import { CUTOFF, DILATION, MARGIN, MOST_ALPHA, NEAR, ROW } from "./splatting.ts";
+import { CUTOFF, MARGIN, MOST_ALPHA, NEAR, ROW } from "./splatting.ts";
 
 export const SPLAT_VERTEX = `#version 300 es
 precision highp float;
@@ -14,6 +14,7 @@ uniform vec3 translation;
 uniform vec2 focal;            // pixels
 uniform vec2 principal;        // pixels
 uniform vec2 size;             // pixels
+uniform float dilation;        // pixels^2
 layout(location = 0) in uint primitive;
 out vec2 place;                // standard deviations from the middle
 out vec4 color;
@@ -33,13 +34,13 @@ void main() {
   vec3 row0 = vec3(focal.x / p.z, 0.0, -focal.x * ratio.x / p.z) * rotation;
   vec3 row1 = vec3(0.0, focal.y / p.z, -focal.y * ratio.y / p.z) * rotation;
   vec3 c0 = covariance * row0;
-  float a = dot(row0, c0) + ${DILATION};
+  float a = dot(row0, c0) + dilation;
   float b = dot(row1, c0);
-  float c = dot(row1, covariance * row1) + ${DILATION};
+  float c = dot(row1, covariance * row1) + dilation;
   // Principal axes of the ellipse.
   float radius = length(vec2(0.5 * (a - c), b));
   float largest = 0.5 * (a + c) + radius;
-  float smallest = max((a * c - b * b) / largest, 1e-6);
+  float smallest = max((a * c - b * b) / largest, dilation);  // never less, but a difference loses digits
   vec2 axis = a >= c ? vec2(largest - c, b) : vec2(b, largest - a);
   axis = radius > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
   float reach = sqrt(2.0 * log(color.a / ${CUTOFF})) + 1e-3;  // where alpha falls below the cutoff

@@ -1,7 +1,7 @@
 /** Draws splats with WebGPU. Sums are kept in 16-bit floats: 8 bits lose faint splats. */
 
 import { CannotDraw, type FrameCamera, type Renderer, tooManySplats } from "./renderer.ts";
-import { PLANES, ROW } from "./splatting.ts";
+import { PLANES, ROW, dilationOf } from "./splatting.ts";
 import { SHADERS, VIEW } from "./webgpu_shaders.ts";
 
 const BYTES = 16; // of a primitive in a plane, or of its color and opacity
@@ -32,6 +32,7 @@ export class WebGPURenderer implements Renderer {
   readonly name = "webgpu";
   readonly lost: Promise<string>;
   background: [number, number, number] = [0, 0, 0];
+  angularDilation: number | null = null;
   private readonly view: GPUBuffer;
   private splats: Splats | null = null;
   private picture: Picture | null = null;
@@ -143,6 +144,7 @@ export class WebGPURenderer implements Renderer {
     view.set([fx, fy], VIEW.focal);
     view.set([cx, cy], VIEW.principal);
     view.set([width, height], VIEW.size);
+    view[VIEW.dilation] = dilationOf(this.angularDilation, camera);
     view.set(this.background, VIEW.background);
     return view;
   }

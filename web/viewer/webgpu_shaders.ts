@@ -1,6 +1,6 @@
 /** The shaders of webgl2_shaders.ts in WGSL. */
 
-import { CUTOFF, DILATION, MARGIN, MOST_ALPHA, NEAR, PLANES } from "./splatting.ts";
+import { CUTOFF, MARGIN, MOST_ALPHA, NEAR, PLANES } from "./splatting.ts";
 
 /** 4-byte numbers of `View`, and where its fields begin. */
 export const VIEW = {
@@ -10,6 +10,7 @@ export const VIEW = {
   focal: 16,
   principal: 18,
   size: 20,
+  dilation: 22,
   background: 24,
 } as const;
 
@@ -20,6 +21,7 @@ struct View {
   focal: vec2f,            // pixels
   principal: vec2f,        // pixels
   size: vec2f,             // pixels
+  dilation: f32,           // pixels^2
   background: vec3f,
 }
 struct Corner {
@@ -52,13 +54,13 @@ fn splatCorner(@location(0) primitive: u32, @builtin(vertex_index) vertex: u32) 
   let row0 = view.rows * vec3f(focal.x / p.z, 0.0, -focal.x * ratio.x / p.z);
   let row1 = view.rows * vec3f(0.0, focal.y / p.z, -focal.y * ratio.y / p.z);
   let c0 = covariance * row0;
-  let a = dot(row0, c0) + ${DILATION};
+  let a = dot(row0, c0) + view.dilation;
   let b = dot(row1, c0);
-  let c = dot(row1, covariance * row1) + ${DILATION};
+  let c = dot(row1, covariance * row1) + view.dilation;
   // Principal axes of the ellipse.
   let radius = length(vec2f(0.5 * (a - c), b));
   let largest = 0.5 * (a + c) + radius;
-  let smallest = max((a * c - b * b) / largest, 1e-6);
+  let smallest = max((a * c - b * b) / largest, view.dilation);  // never less, but a difference loses digits
   var axis = vec2f(1.0, 0.0);
   if (radius > 0.0) { axis = normalize(select(vec2f(b, largest - a), vec2f(largest - c, b), a >= c)); }
   let reach = sqrt(2.0 * log(color.a / ${CUTOFF})) + 1e-3;  // where alpha falls below the cutoff

@@ -128,10 +128,20 @@ function infoOf(scene: Scene, { positions }: Predictor): SceneInfo {
     const at = (share: number): number => sorted[Math.floor(share * (sorted.length - 1))]!;
     return { middle: at(0.5), half: (at(0.9) - at(0.1)) / 2 };
   });
-  const { anchors, totalAnchors, coupled, background, worldOffset, viewpoints } = scene;
+  const { anchors, totalAnchors, coupled, background, angularDilation, worldOffset, viewpoints } = scene;
   const middle: [number, number, number] = [range[0]!.middle, range[1]!.middle, range[2]!.middle];
   const extent = Math.max(...range.map(({ half }) => half), scene.voxelSize);
-  return { anchors, totalAnchors, coupled, background, worldOffset, viewpoints, middle, extent };
+  return {
+    anchors,
+    totalAnchors,
+    coupled,
+    background,
+    angularDilation,
+    worldOffset,
+    viewpoints,
+    middle,
+    extent,
+  };
 }
 
 /** One frame at a time, with room for messages in between. */

@@ -94,17 +94,17 @@ def settings_of_tile(place: str) -> RunSettings:
         tile = plan.tile(name)
     settings = load_settings(Path(path).parent)
     entry = {"ground": ground_entry(plan.ground), **tile.to_dict()}
-    return replace(settings, tiles=None, tile=entry, config=_with_voxels(settings.config, tile.spacing))
+    return replace(settings, tiles=None, tile=entry, config=_of_a_tile(settings.config, tile.spacing))
 
 
-def _with_voxels(config: "Config", spacing: float) -> "Config":
-    """Voxels as the tile's own points ask for: those outside are perhaps thinned out, and would ask for larger ones."""
+def _of_a_tile(config: "Config", spacing: float) -> "Config":
+    """Voxels as the tile's own points ask for: those outside are perhaps thinned out, and would ask for larger ones.
+    One dilation, however many views see a tile: all are drawn in one picture.
+    """
     from compgs.training.grid import grid_spacings
 
-    m = config.model
-    if m.voxel_size:
-        return config
-    return replace(config, model=replace(m, voxel_size=grid_spacings(config) * spacing))
+    m = replace(config.model, sharp_where_many=0.0)
+    return replace(config, model=replace(m, voxel_size=m.voxel_size or grid_spacings(config) * spacing))
 
 
 def block(scene: "Scene", settings: RunSettings) -> "Scene":

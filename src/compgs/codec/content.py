@@ -144,6 +144,8 @@ class FileContent:
     mask: np.ndarray  # [N, K] bool: which coupled primitives exist
     groups: tuple[Group, ...]
     heads: tuple[tuple[str, QuantizedTensor], ...]  # prediction networks' parameters by name
+    # float32, of what is drawn (`RasterSettings`); None, in files before version 4: 0.3 pixels^2 at every size.
+    angular_dilation: float | None = None
     viewpoints: Viewpoints | None = None  # where to look from
     # Last octree level of each range, on which what neighbours have depends; None: as `chosen_levels`.
     levels: tuple[int, ...] | None = None

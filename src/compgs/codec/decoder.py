@@ -99,6 +99,7 @@ def from_latents(content: FileContent, latents: Latents) -> HybridModel:
         content.view_distance_scale,
         content.background,
         world_offset=content.world_offset,
+        angular_dilation=content.angular_dilation,
     )
     if content.viewpoints is None:
         return model

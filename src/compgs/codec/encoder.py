@@ -117,6 +117,7 @@ def _coded_model(model: TrainedModel, viewpoints: int | None) -> tuple[FileConte
         world_offset=model.world_offset,
         view_distance_scale=model.distance_unit,
         background=model.background,
+        angular_dilation=model.angular_dilation,
         coordinates=coordinates,
         mask=mask,
         groups=tuple(chain.groups),

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from compgs.errors import CorruptSection, NotACompGSFile, NotEncodable, TruncatedSection, UnsupportedVersion
 
 MAGIC = b"\x93CGS"  # not text, and not valid UTF-8
-VERSION = 3
-OLDEST_VERSION = 2  # that is read; the same without context from neighbours
+VERSION = 4
+OLDEST_VERSION = 2  # that is read
+FIRST_WITH_NEIGHBOURS = 3  # version from which on groups may take what neighbours have
+FIRST_WITH_DILATION = 4  # version from which on the scene section has an angular dilation
 OPTIONAL = 0x80  # sections with this bit in their number may be skipped by a decoder that does not know them
 MAX_SECTIONS = 64
 MAX_FILE_BYTES = (1 << 32) - 1
@@ -46,6 +48,8 @@ SECTION_NAMES = {
     VIEWPOINTS: "viewpoints",
 }
 REQUIRED = (SCENE, MASKS, TABLES, NETWORKS, HEADS, LATENTS)
+
+SMALLEST_DILATION, LARGEST_DILATION = 2.0**-40, 1.0  # of an angular dilation: squares of tangents
 
 # Limits of what a file may hold; a decoder checks them, and the lengths, before it allocates.
 MAX_ANCHORS = 1 << 24
@@ -92,7 +96,7 @@ def container_bytes(sections: int) -> int:
     return _HEADER.size + sections * _ENTRY.size + _CRC.size
 
 
-def pack(sections: list[Section], version: int = VERSION) -> bytes:
+def pack(sections: list[Section], version: int) -> bytes:
     """A file of these sections, in this order."""
     if container_bytes(len(sections)) + sum(len(s.data) for s in sections) > MAX_FILE_BYTES:
         raise NotEncodable(f"the file would exceed {MAX_FILE_BYTES} bytes")

@@ -188,6 +188,7 @@ def read_latents(
         world_offset=scene.world_offset,
         view_distance_scale=scene.view_distance_scale,
         background=scene.background,
+        angular_dilation=scene.angular_dilation,
         coordinates=coordinates,
         mask=mask,
         groups=tuple(map(Group, d.groups, priors, all_symbols)),

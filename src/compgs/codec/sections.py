@@ -11,6 +11,9 @@ import numpy as np
 from compgs.codec.content import LOG_SCALES, Dimensions, FileContent, GroupShape, Role
 from compgs.codec.fields import FieldReader, signed_varint, varint
 from compgs.codec.format import (
+    FIRST_WITH_DILATION,
+    FIRST_WITH_NEIGHBOURS,
+    LARGEST_DILATION,
     MAX_ANCHORS,
     MAX_COUPLED_PRIMITIVES,
     MAX_GROUPS,
@@ -20,7 +23,7 @@ from compgs.codec.format import (
     MAX_SIDE_DIM,
     MAX_WIDTH,
     OLDEST_VERSION,
-    VERSION,
+    SMALLEST_DILATION,
 )
 from compgs.codec.tables import LEVELS, MAX_HYPER_SYMBOLS, MAX_LOWEST, MAX_TABLES, HyperTable
 from compgs.codec.weights import decode_arrays, encode_arrays
@@ -30,6 +33,7 @@ HEADS: tuple[Literal["separate", "paired"], ...] = ("separate", "paired")  # the
 # anchors, coupled primitives that exist | K, residual_dim, heads, width | voxel_size, world_offset,
 # view_distance_scale | background
 SCENE_LAYOUT = "<II BBBH ddddd fff"
+DILATION_LAYOUT = "<f"  # behind it, from FIRST_WITH_DILATION on
 
 # Of the floating-point numbers: none may be zero, subnormal or infinite as a 32-bit number, nor its product
 # with a latent.
@@ -55,6 +59,7 @@ class SceneSection:
     world_offset: tuple[float, float, float]
     view_distance_scale: float
     background: tuple[float, float, float]
+    angular_dilation: float | None
 
 
 def encode_scene(content: FileContent) -> bytes:
@@ -72,12 +77,17 @@ def encode_scene(content: FileContent) -> bytes:
         content.view_distance_scale,
         *content.background,
     )
+    if content.angular_dilation is not None:
+        fields += struct.pack(DILATION_LAYOUT, content.angular_dilation)
     return fields + bytes([len(d.groups)]) + b"".join(starmap(_encode_group, enumerate(d.groups)))
 
 
-def least_version(d: Dimensions) -> int:
-    """Of the format, for such groups."""
-    return VERSION if any(group.sees_neighbours for group in d.groups) else OLDEST_VERSION
+def least_version(content: FileContent) -> int:
+    """Of the format, for what a file holds."""
+    if content.angular_dilation is not None:
+        return FIRST_WITH_DILATION
+    sees_neighbours = any(group.shape.sees_neighbours for group in content.groups)
+    return FIRST_WITH_NEIGHBOURS if sees_neighbours else OLDEST_VERSION
 
 
 def _encode_group(index: int, shape: GroupShape) -> bytes:
@@ -87,7 +97,7 @@ def _encode_group(index: int, shape: GroupShape) -> bytes:
     return bytes([shape.role]) + varint(shape.channels) + varint(context) + varint(len(shape.steps)) + steps
 
 
-def decode_scene(data: bytes, section: str, version: int = VERSION) -> SceneSection:
+def decode_scene(data: bytes, section: str, version: int) -> SceneSection:
     reader = FieldReader(data, section)
     anchors, coupled, k, residual_dim, heads, width, *numbers = reader.struct(SCENE_LAYOUT, "fields")
     if not 1 <= anchors <= MAX_ANCHORS:
@@ -96,13 +106,23 @@ def decode_scene(data: bytes, section: str, version: int = VERSION) -> SceneSect
         raise CorruptSection(f"{section}: {coupled} coupled primitives, expected at most {k} for each anchor")
     if heads >= len(HEADS):
         raise CorruptSection(f"{section}: heads are {heads}, expected 0 to {len(HEADS) - 1}")
+    dilation: float | None = None
+    if version >= FIRST_WITH_DILATION:
+        (dilation,) = reader.struct(DILATION_LAYOUT, "angular_dilation")
     count = reader.varint("groups", 1, MAX_GROUPS)
     groups = tuple(_decode_group(reader, i, version) for i in range(count))
     reader.end()
     d = Dimensions(k, residual_dim, HEADS[heads], width, groups)
     voxel, x, y, z, distance, *background = numbers
     scene = SceneSection(
-        anchors, coupled, d, voxel, (x, y, z), distance, (background[0], background[1], background[2])
+        anchors,
+        coupled,
+        d,
+        voxel,
+        (x, y, z),
+        distance,
+        (background[0], background[1], background[2]),
+        dilation,
     )
     problem = wrong_dimension(d) or wrong_number(scene)
     if problem:
@@ -113,7 +133,7 @@ def decode_scene(data: bytes, section: str, version: int = VERSION) -> SceneSect
 def _decode_group(reader: FieldReader, index: int, version: int) -> GroupShape:
     role = Role(reader.varint(f"role of group {index}", 0, max(Role)))
     channels = reader.varint(f"channels of group {index}", 1, CHANNEL_LIMITS[role])
-    most = (4 if version > OLDEST_VERSION else 2) << index
+    most = (4 if version >= FIRST_WITH_NEIGHBOURS else 2) << index
     context = reader.varint(f"context of group {index}", 0, most - 1)
     count = reader.varint(f"steps of group {index}", 0, channels)
     steps = reader.struct(f"<{count}f", f"steps of group {index}")
@@ -165,6 +185,9 @@ def wrong_number(scene: SceneSection | FileContent) -> str:
         values = getattr(scene, name)
         if len(values) != 3 or not all(abs(value) <= LARGEST for value in values):
             return f"{name} is {values}, expected three numbers up to {LARGEST:.3g}"
+    dilation = scene.angular_dilation
+    if dilation is not None and not SMALLEST_DILATION <= dilation <= LARGEST_DILATION:
+        return f"angular_dilation is {dilation}, expected {SMALLEST_DILATION:.3g} to {LARGEST_DILATION:.3g}"
     return ""
 
 

@@ -102,7 +102,7 @@ def write_content(
         sections.append(Section(PADDING, bytes(padding)))
     if content.metadata:
         ranges.append(Section(METADATA, encode_metadata(content.metadata)))
-    return pack(sections + ranges, least_version(content.dimensions))
+    return pack(sections + ranges, least_version(content))
 
 
 def _positions(coordinates: np.ndarray, geometry: Geometry) -> Section:

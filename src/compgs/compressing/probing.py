@@ -13,7 +13,7 @@ from compgs.cameras import Camera
 from compgs.formats.arrays import normalized
 from compgs.gaussians import Gaussians
 from compgs.model.splats import SplatModel
-from compgs.render import RasterSettings, blend_of, contributions, local_camera, visible_mask
+from compgs.render import blend_of, contributions, local_camera, settings_of, visible_mask
 
 PROBE_SIDE = 80  # pixels, the longer side of a probing picture
 INSIDE = 3.0  # standard deviations from a splat's middle: whoever is nearer stands in it
@@ -46,7 +46,7 @@ def probe(model: SplatModel, camera: Camera) -> Probe:
     scale = PROBE_SIDE / max(camera.width, camera.height)
     width, height = (max(1, round(side * scale)) for side in (camera.width, camera.height))
     small = local_camera(model, camera.resized(width, height))
-    settings = RasterSettings(background=model.background)
+    settings = settings_of(model)
     visible = visible_mask(*model.bounds, small, settings)
     gaussians = model.gaussians(small, visible)
     weights = contributions(gaussians, small, settings, blend_of(model))

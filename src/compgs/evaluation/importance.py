@@ -7,7 +7,7 @@ import numpy as np
 from compgs.cameras import Camera
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
-from compgs.render import RasterSettings, blend_of, contributions, local_camera, visible_mask
+from compgs.render import blend_of, contributions, local_camera, settings_of, visible_mask
 
 
 def importance(
@@ -17,7 +17,7 @@ def importance(
 
     `progress(done, total)` is called after each camera.
     """
-    settings = RasterSettings(background=model.background)
+    settings = settings_of(model)
     total = np.zeros(model.coupled)
     for i, world_camera in enumerate(cameras):
         camera = local_camera(model, world_camera)
@@ -33,7 +33,7 @@ def splat_importance(
     model: SplatModel, cameras: Sequence[Camera], progress: Callable[[], None] | None = None
 ) -> np.ndarray:  # [M] float32, pixels
     """The same of splats; `progress()` is called after each camera."""
-    settings = RasterSettings(background=model.background)
+    settings = settings_of(model)
     total = np.zeros(len(model.splats), np.float32)
     for world_camera in cameras:
         camera = local_camera(model, world_camera)

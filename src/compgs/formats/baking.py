@@ -22,7 +22,7 @@ from compgs.model.degrees import coefficients, degree_of
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.spherical_harmonics import COLOR_OFFSET, Y0, harmonic_basis
 from compgs.model.splats import SplatArrays
-from compgs.render import RasterSettings, blend_of, contributions, local_camera, visible_mask
+from compgs.render import RasterSettings, blend_of, contributions, local_camera, settings_of, visible_mask
 
 # Opacity that primitives of anchors in view are given to find out what reaches them, where they are not drawn: it must
 # be above the rasterizer's cutoff, and hide little. Without it a primitive that is there from one side only is there
@@ -66,7 +66,7 @@ def bake(
     2.5 dB against 96. Memory: 1.2 kB a primitive at degree 3. Raises TrainingError if there is nothing to be seen.
     """
     sums = _Sums.zeros(model.coupled, degree)
-    settings = RasterSettings(background=model.background)
+    settings = settings_of(model)
     for camera in cameras:
         _add_view(sums, model, local_camera(model, camera), settings)
         if progress:

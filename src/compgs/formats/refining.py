@@ -56,7 +56,7 @@ def _gradients(
     splats: SplatArrays, model: Renderable, camera: Camera, picture: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Of the mean squared difference to a picture [H, W, 3] from a camera of the model's frame, by what is fitted."""
-    settings = RasterSettings(background=model.background)
+    settings = RasterSettings(background=model.background)  # of the splats: others draw them so at every size
     seen = np.flatnonzero(visible_mask(splats.means, splat_radii(splats.log_scales), camera, settings))
     means, rest = splats.means[seen], splats.rest[seen]
     opacities = sigmoid(splats.opacity_logits[seen])

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compgs.cameras import Camera
+from compgs.codec.format import LARGEST_DILATION, SMALLEST_DILATION
 from compgs.errors import CorruptSection, NotACompGSFile, TruncatedSection, UnsupportedVersion
 
 if TYPE_CHECKING:
@@ -89,12 +90,14 @@ class Manifest:
     up: Vector  # direction of the sky
     viewpoints: tuple[Camera, ...] = ()  # of the world, the best first
     ground: GroundAxes | None = None
+    angular_dilation: float | None = None  # of what is drawn (`RasterSettings`)
 
     def encoded(self) -> bytes:
         """The content of the file: JSON."""
         content = {
             "world_offset": list(self.world_offset),
             "background": list(self.background),
+            "angular_dilation": self.angular_dilation,
             "up": list(self.up),
             "ground": None if self.ground is None else ground_entry(self.ground),
             "viewpoints": [_camera_entry(camera) for camera in self.viewpoints],
@@ -276,7 +279,18 @@ def _manifest(content: dict[str, Any]) -> Manifest:
         up=_vector(content["up"]),
         viewpoints=_list(content["viewpoints"], 0, MOST_TILES, _camera),
         ground=None if ground is None else ground_from_entry(ground),
+        angular_dilation=_angular_dilation(content.get("angular_dilation")),
     )
+
+
+def _angular_dilation(value: Any) -> float | None:
+    """None in manifests from before tiles had one."""
+    if value is None:
+        return None
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not SMALLEST_DILATION <= value <= LARGEST_DILATION:
+        raise ValueError(f"angular_dilation is {value!r:.80}")
+    return float(value)
 
 
 def _tile(entry: dict[str, Any]) -> TileEntry:

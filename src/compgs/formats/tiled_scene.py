@@ -139,6 +139,10 @@ class TiledScene:
         return self.manifest.world_offset
 
     @property
+    def angular_dilation(self) -> float | None:
+        return self.manifest.angular_dilation
+
+    @property
     def up(self) -> Vector:
         """Direction of the sky."""
         return self.manifest.up

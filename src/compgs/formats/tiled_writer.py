@@ -39,8 +39,8 @@ def write_tiles(folder: Path, tiles: Iterable[NewTile], ground: GroundAxes | Non
     """Write a folder of tiles; the path of its manifest. Tiles are taken one at a time.
 
     The manifest is written last, so that a folder with one is whole; while tiles are replaced there is none. Files of
-    tiles that are not among the new ones go. All tiles are shown over the first one's background. Raises BitstreamError
-    for what is no .cgs file, ConfigError for names that no two tiles may have, OutputError.
+    tiles that are not among the new ones go. All tiles are shown over the first one's background and with its dilation.
+    Raises BitstreamError for what is no .cgs file, ConfigError for names that no two tiles may have, OutputError.
     """
     manifest = folder / MANIFEST
     _remove([manifest])
@@ -54,7 +54,7 @@ def write_tiles(folder: Path, tiles: Iterable[NewTile], ground: GroundAxes | Non
         model = decode_bytes(tile.data, folder / f"{tile.name}.cgs")
         write_bytes(folder / f"{tile.name}.cgs", tile.data)
         entries.append(_entry(tile, model))
-        kept.append(_Kept(model.background, model.up, model.viewpoints))
+        kept.append(_Kept(model.background, model.up, model.viewpoints, model.angular_dilation))
     if not entries:
         raise ConfigError(f"{folder}: there are no tiles to write")
     offset = common_offset([entry.world_offset for entry in entries])
@@ -65,6 +65,7 @@ def write_tiles(folder: Path, tiles: Iterable[NewTile], ground: GroundAxes | Non
         up=_mean_direction([each.up for each in kept]),
         viewpoints=_in_turns([each.viewpoints for each in kept]),
         ground=ground,
+        angular_dilation=kept[0].angular_dilation,
     )
     names = {entry.file for entry in entries}
     _remove([file for file in folder.glob("*.cgs") if file.name not in names])
@@ -79,6 +80,7 @@ class _Kept:
     background: Vector
     up: Vector
     viewpoints: tuple[Camera, ...]
+    angular_dilation: float | None
 
 
 def common_offset(offsets: Sequence[Vector]) -> Vector:

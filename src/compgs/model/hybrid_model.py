@@ -38,6 +38,7 @@ class HybridModel:
     world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     viewpoints: tuple[Camera, ...] = ()  # of the world: where to look from, the best first
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # direction of the sky
+    angular_dilation: float | None = None  # of what is drawn (`RasterSettings`)
 
     @property
     def anchors(self) -> int:

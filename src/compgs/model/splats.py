@@ -92,6 +92,11 @@ class SplatModel:
         return self.splats.world_offset
 
     @property
+    def angular_dilation(self) -> None:
+        """3DGS's pixels, in pictures of every size."""
+        return None
+
+    @property
     def counts(self) -> Mapping[str, int]:
         return {"splats": len(self.splats)}
 

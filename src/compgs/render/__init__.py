@@ -6,7 +6,7 @@ from typing import Any
 
 from compgs.render.contributions import Blended, contributions
 from compgs.render.rasterize import blended, rasterize
-from compgs.render.render_model import Renderable, blend_of, local_camera, render
+from compgs.render.render_model import Renderable, blend_of, local_camera, render, settings_of
 from compgs.render.result import RasterResult
 from compgs.render.settings import RasterSettings
 from compgs.render.visibility import visible_mask
@@ -22,6 +22,7 @@ __all__ = [
     "local_camera",
     "rasterize",
     "render",
+    "settings_of",
     "visible_mask",
 ]
 

@@ -54,7 +54,7 @@ def camera_numbers(camera: Camera, settings: RasterSettings) -> np.ndarray:
             *camera.translation,
             *(camera.fx, camera.fy, camera.cx, camera.cy),
             *jacobian_limits(camera, settings),
-            *(settings.near_plane, settings.dilation),
+            *(settings.near_plane, settings.dilation_of(camera)),
         ],
         dtype=np.float32,
     )

@@ -29,6 +29,11 @@ class Renderable(Protocol):
         ...
 
     @property
+    def angular_dilation(self) -> float | None:
+        """As `RasterSettings.angular_dilation`; None: the same pixels in pictures of every size."""
+        ...
+
+    @property
     def world_offset(self) -> tuple[float, float, float]:
         """World units, float64: origin of the local frame."""
         ...
@@ -66,6 +71,12 @@ class Renderable(Protocol):
         ...
 
 
+def settings_of(model: Renderable, background: tuple[float, float, float] | None = None) -> RasterSettings:
+    """How a scene is drawn, over its own background or another."""
+    behind = model.background if background is None else background
+    return RasterSettings(background=behind, angular_dilation=model.angular_dilation)
+
+
 def local_camera(model: Renderable, camera: Camera) -> Camera:
     """A camera of the world in the model's own frame, moved in double precision: where the two meet."""
     return _moved(camera, model.world_offset)
@@ -100,7 +111,7 @@ class Trained(Protocol):
 def render(
     model: Renderable | Trained, camera: Camera, settings: RasterSettings | None = None
 ) -> RasterResult[np.ndarray]:
-    """One view of a scene, from a camera of the world, as numpy arrays. By default over the model's own background.
+    """One view of a scene, from a camera of the world, as numpy arrays. By default as `settings_of` has it.
 
     A trained model is quantized anew for each view; for many views, render its `as_hybrid_model()`. Raises ConfigError
     for what is no model.
@@ -112,7 +123,7 @@ def render(
             f"model: expected what compgs.train or compgs.decode gives, found {type(model).__name__}"
         )
     camera = local_camera(model, camera)
-    settings = settings or RasterSettings(background=model.background)
+    settings = settings or settings_of(model)
     if isinstance(model, DrawsItself):
         return model.draw(camera, settings)
     centers, radii = model.bounds

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from compgs.cameras import Camera
 
+# Pixels^2, of pictures much smaller than those of the training, where splats would fall between the pixels.
+LEAST_DILATION = 0.02
+
 
 @dataclass(frozen=True)
 class RasterSettings:
@@ -18,6 +21,15 @@ class RasterSettings:
     alpha_cap: float = 0.999  # no splat is more opaque than this (gsplat)
     transmittance_stop: float = 1e-4  # a pixel is finished before its transmittance falls to this (3DGS)
     margin: float = 0.3  # half images; beyond the image plus this margin the Jacobian is held constant (3DGS)
+    # The same as a scene was trained with, whatever the size of the picture: per fx fy of a camera (squares of the
+    # tangents of angles), in place of `dilation`.
+    angular_dilation: float | None = None
+
+    def dilation_of(self, camera: Camera) -> float:
+        """Pixels^2 that are added in the picture of a camera."""
+        if self.angular_dilation is None:
+            return self.dilation
+        return max(LEAST_DILATION, self.angular_dilation * camera.fx * camera.fy)
 
 
 DEFAULT_SETTINGS = RasterSettings()

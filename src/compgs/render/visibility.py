@@ -42,7 +42,7 @@ def frustum(camera: Camera, settings: RasterSettings) -> np.ndarray:
     left, right, top, bottom = jacobian_limits(camera, settings)
     across, down = math.hypot(1, max(-left, right)), math.hypot(1, max(-top, bottom))
     sigmas = math.sqrt(2 * math.log(1 / settings.alpha_cutoff))
-    dilated = sigmas * math.sqrt(settings.dilation)  # pixels
+    dilated = sigmas * math.sqrt(settings.dilation_of(camera))  # pixels
     pad_x, pad_y = dilated / camera.fx, dilated / camera.fy
     rows = np.array(
         [

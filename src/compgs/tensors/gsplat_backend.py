@@ -41,7 +41,7 @@ def rasterize_gsplat(gaussians: Gaussians, camera: Camera, settings: RasterSetti
         intrinsics,
         camera.width,
         camera.height,
-        eps2d=settings.dilation,
+        eps2d=settings.dilation_of(camera),
         near_plane=settings.near_plane,
         packed=False,
         opacities=opacities.contiguous(),
@@ -73,7 +73,7 @@ def rasterize_gsplat(gaussians: Gaussians, camera: Camera, settings: RasterSetti
 
 def check_settings(settings: RasterSettings) -> None:
     """Raises ConfigError for a setting that gsplat's kernels hold as a compiled constant."""
-    free = {"background", "near_plane", "dilation"}
+    free = {"background", "near_plane", "dilation", "angular_dilation"}
     fixed = replace(DEFAULT_SETTINGS, **{name: getattr(settings, name) for name in free})
     if settings != fixed:
         raise ConfigError(

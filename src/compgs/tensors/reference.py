@@ -86,7 +86,7 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> S
         -2,
     )  # [M, 2, 3] pixels per world unit
     factor = jacobian @ rotation @ rotation_matrices(quaternions) * scales[:, None, :]
-    dilation = settings.dilation * torch.eye(2, dtype=like.dtype, device=like.device)
+    dilation = settings.dilation_of(camera) * torch.eye(2, dtype=like.dtype, device=like.device)
     covariances = factor @ factor.mT + dilation
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
     return Splats(torch.where(drawn[:, None], means2d, zero[:, None]), covariances, z.detach(), drawn)

@@ -36,7 +36,7 @@ from compgs.training.restoring import (
 )
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
-CHECKPOINT_VERSION = "8"
+CHECKPOINT_VERSION = "9"
 
 
 @dataclass(frozen=True)
@@ -106,6 +106,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, writer: Writer | None = 
                 "background": list(model.background),
                 "viewpoints": [_camera_entry(camera) for camera in model.viewpoints],
                 "up": list(model.up),
+                "angular_dilation": model.angular_dilation,
                 "world_offset": list(model.world_offset),
                 "coupled_primitives": model.dimensions.coupled_primitives,
                 "width": model.dimensions.width,
@@ -205,6 +206,8 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
         (x, y, z),
         made,
     )
+    if scene["angular_dilation"] is not None:
+        (model.angular_dilation,) = finite([scene["angular_dilation"]], 1, "angular_dilation", above=0.0)
     model.head_bits = whole_number(scene["head_bits"], 1, config.entropy.head_bits, "head_bits")
     model.viewpoints = tuple(_camera(entry) for entry in scene["viewpoints"])
     up_x, up_y, up_z = finite(scene["up"], 3, "up")

@@ -13,6 +13,7 @@ from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
+from compgs.training.dilation import angular_dilation, dilation
 from compgs.training.grid import grid_spacings
 from compgs.training.network_size import head_bits, head_layout, hidden_width, reference_context
 from compgs.training.own_residuals import coupled_primitives, own_residuals
@@ -56,6 +57,8 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
     if cameras:
         model.viewpoints = tuple(cameras[i] for i in choose_viewpoints(cameras, MAX_VIEWPOINTS))
         model.up = up_direction(cameras)
+        pixels = dilation(config, len(coordinates), len(cameras))
+        model.angular_dilation = angular_dilation(pixels, cameras)
     return model
 
 

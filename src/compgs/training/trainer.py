@@ -155,7 +155,9 @@ class Trainer:
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
         self.noise = UniformNoise(t.seed + 3, self.views.chance, device)
         self.reference_rates: Tensor | None = None  # [reference_dim], once the channels differ in it
-        self.settings = RasterSettings(background=scene.background)
+        self.settings = RasterSettings(
+            background=scene.background, angular_dilation=self.model.angular_dilation
+        )
         self.few = fewness(views)
         self.left_out = t.left_out * self.few
         self.step = 0

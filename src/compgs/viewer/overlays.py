@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compgs.cameras import Camera
-from compgs.render import RasterSettings, Renderable, blend_of, contributions, local_camera, visible_mask
+from compgs.render import Renderable, blend_of, contributions, local_camera, settings_of, visible_mask
 
 MOST_POINTS = 200_000
 MOST_FRUSTUMS = 200
@@ -40,8 +40,9 @@ def ellipsoids(model: Renderable, camera: Camera, most: int) -> Ellipsoids:
     share = min(1.0, JUDGED_SIDE / max(camera.width, camera.height))
     width, height = max(1, round(share * camera.width)), max(1, round(share * camera.height))
     local = local_camera(model, camera.resized(width, height))
-    g = model.gaussians(local, visible_mask(*model.bounds, local, RasterSettings()))
-    weights = contributions(g, local, blend=blend_of(model))
+    settings = settings_of(model)
+    g = model.gaussians(local, visible_mask(*model.bounds, local, settings))
+    weights = contributions(g, local, settings, blend_of(model))
     largest = np.argsort(-weights, kind="stable")[: min(most, int((weights > 0).sum()))]
     means, quaternions, scales, colors = (
         t[np.sort(largest)] for t in (g.means, g.quaternions, g.scales, g.colors)

@@ -18,7 +18,7 @@ from compgs.cameras import Camera
 from compgs.errors import CompGSError
 from compgs.metrics import to_8bit
 from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
-from compgs.render import RasterSettings, render
+from compgs.render import render, settings_of
 from compgs.viewer.pace import Pace
 from compgs.viewer.shown import Shown, Vector
 from compgs.viewer.stage import Stage
@@ -156,7 +156,7 @@ class Visitor:
         start = self.clock()
         model = self.shown.model(look.level, fresh=full)
         camera = self.in_world(self.page.lens().camera(look.share * pace.share))
-        result = render(model, camera, RasterSettings(background=look.background))
+        result = render(model, camera, settings_of(model, look.background))
         image = to_8bit(result.image)
         seconds = self.clock() - start
         share = pace.share
@@ -169,7 +169,7 @@ class Visitor:
 
         def job() -> np.ndarray:
             model = self.shown.model(self.look.level, fresh=True)
-            return to_8bit(render(model, camera, RasterSettings(background=self.look.background)).image)
+            return to_8bit(render(model, camera, settings_of(model, self.look.background)).image)
 
         return self.stage.run(job)
 

@@ -1,8 +1,10 @@
 /** The constants of docs/bitstream.md, under the same names. */
 
 export const MAGIC = [0x93, 0x43, 0x47, 0x53] as const;
-export const VERSION = 3;
+export const VERSION = 4;
 export const OLDEST_VERSION = 2;
+export const FIRST_WITH_NEIGHBOURS = 3;
+export const FIRST_WITH_DILATION = 4;
 export const OPTIONAL = 0x80;
 export const MAX_SECTIONS = 64;
 export const MAX_ANCHORS = 1 << 24;
@@ -24,6 +26,8 @@ export const HEAD_PRODUCTS_PER_BYTE = 2 ** 17;
 export const MAX_METADATA_BYTES = 4096;
 export const SMALLEST = 2 ** -64;
 export const LARGEST = 2 ** 64;
+export const SMALLEST_DILATION = 2 ** -40;
+export const LARGEST_DILATION = 1;
 export const TOTAL = 65536;
 export const GAUSSIAN_COUNT = 128;
 export const GAUSSIAN_CRC32 = 0xad3b4090;

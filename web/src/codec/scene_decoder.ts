@@ -48,6 +48,11 @@ export interface Scene {
   worldOffset: [number, number, number];
   viewDistanceScale: number;
   background: [number, number, number];
+  /**
+   * What is added to the variances of splats in a picture, as the square of an angle's tangent; null: the same pixels
+   * in pictures of every size.
+   */
+  angularDilation: number | null;
   /** Octree levels. */
   depth: number;
   /** [anchors, 3] in canonical order */

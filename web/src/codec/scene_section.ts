@@ -1,7 +1,10 @@
 /** The scene section: how much of everything there is, and in what units. */
 
 import {
+  FIRST_WITH_DILATION,
+  FIRST_WITH_NEIGHBOURS,
   LARGEST,
+  LARGEST_DILATION,
   LOG_SCALES,
   MAX_ANCHORS,
   MAX_COUPLED_PRIMITIVES,
@@ -12,6 +15,7 @@ import {
   MAX_TABLES,
   MAX_WIDTH,
   SMALLEST,
+  SMALLEST_DILATION,
 } from "./constants.ts";
 import { FieldReader } from "./fields.ts";
 import { NEIGHBOUR_INPUTS } from "./neighbours.ts";
@@ -52,6 +56,7 @@ export interface SceneSection {
   worldOffset: [number, number, number];
   viewDistanceScale: number;
   background: [number, number, number];
+  angularDilation: number | null;
   groups: GroupShape[];
 }
 
@@ -86,6 +91,9 @@ export function readScene(payload: Uint8Array, name: string, version: number): S
   );
   const color = () => upTo("background", reader.f32("background"));
   const background: [number, number, number] = [color(), color(), color()];
+  const dilation = (): number =>
+    between("angular_dilation", reader.f32("angular_dilation"), SMALLEST_DILATION, LARGEST_DILATION);
+  const angularDilation = version < FIRST_WITH_DILATION ? null : dilation();
   const count = between("groups", reader.u8("groups"), 1, MAX_GROUPS);
   const groups: GroupShape[] = [];
   for (let i = 0; i < count; i++) groups.push(readGroup(reader, version, groups, coupledPrimitives));
@@ -111,6 +119,7 @@ export function readScene(payload: Uint8Array, name: string, version: number): S
     worldOffset,
     viewDistanceScale,
     background,
+    angularDilation,
     groups,
   };
 }
@@ -129,8 +138,7 @@ function readGroup(
   const index = before.length;
   const role = reader.varint(`role of group ${index}`, 0, 3);
   const channels = reader.varint(`channels of group ${index}`, 1, CHANNEL_LIMITS[role]!);
-  // Neighbours came with version 3.
-  const bitCount = version < 3 ? index + 1 : index + 2;
+  const bitCount = version < FIRST_WITH_NEIGHBOURS ? index + 1 : index + 2;
   const bits = reader.varint(`context of group ${index}`, 0, 2 ** bitCount - 1);
   const stepCount = reader.varint(`steps of group ${index}`, 0, channels);
   const isLegal = role === Role.side ? stepCount === 0 : stepCount === 1 || stepCount === channels;

@@ -61,6 +61,11 @@ class AnchorScene:
         return self.frame.background
 
     @property
+    def angular_dilation(self) -> None:
+        """3DGS's pixels, in pictures of every size."""
+        return None
+
+    @property
     def world_offset(self) -> tuple[float, float, float]:
         return self.frame.world_offset
 

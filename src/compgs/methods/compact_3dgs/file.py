@@ -48,6 +48,11 @@ class NetworkColored:
         return self.shapes.background
 
     @property
+    def angular_dilation(self) -> None:
+        """3DGS's pixels, in pictures of every size."""
+        return None
+
+    @property
     def world_offset(self) -> Offset:
         return self.shapes.world_offset
 
