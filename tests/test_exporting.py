@@ -11,6 +11,8 @@ import pytest
 
 import compgs
 from compgs import exporting
+from compgs.codec.reader import read_content
+from compgs.codec.writer import write_content
 from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import surround
 from compgs.exporting import Exported, export, own_cameras, smaller
@@ -18,6 +20,7 @@ from compgs.formats import encoded, open_scene, read_ply
 from compgs.formats.arrays import normalized
 from compgs.formats.ply import ply_size
 from compgs.model.splats import SplatArrays, SplatModel
+from compgs.render import RasterSettings
 
 
 @pytest.fixture(autouse=True)
@@ -231,3 +234,33 @@ def test_a_neural_scene_is_baked_over_its_own_viewpoints(
     assert done.splats is not None and 0 < done.splats <= model.coupled
     assert len(done.psnr) == len(model.viewpoints) + 12
     assert done.mean > 30
+
+
+def with_dilation(tiny_cgs: Path, pixels: float, path: Path) -> Path:
+    """The same scene, drawn with so many pixels^2 in its own cameras."""
+    camera = compgs.decode(tiny_cgs).viewpoints[0]
+    content = read_content(tiny_cgs.read_bytes())
+    angle = float(np.float32(pixels / (camera.fx * camera.fy)))
+    path.write_bytes(write_content(replace(content, angular_dilation=angle)))
+    return path
+
+
+def test_splats_are_fitted_in_smaller_pictures_as_others_draw_them_in_large_ones(
+    tmp_path: Path, tiny_cgs: Path
+) -> None:
+    plain = compgs.decode(tiny_cgs)
+    assert exporting.as_others_draw(plain, plain.viewpoints) == RasterSettings(plain.background)
+    model = compgs.decode(with_dilation(tiny_cgs, 0.02, tmp_path / "b.cgs"))
+    camera = model.viewpoints[0]
+    half = camera.resized(camera.width // 2, camera.height // 2)
+    settings = exporting.as_others_draw(model, model.viewpoints)
+    assert settings.dilation_of(camera) == pytest.approx(0.3)
+    assert settings.dilation_of(half) == pytest.approx(0.3 * half.fx * half.fy / (camera.fx * camera.fy))
+
+
+def test_who_exports_a_scene_that_is_sharper_than_others_draw_it_is_told(
+    tmp_path: Path, tiny_cgs: Path
+) -> None:
+    for pixels, softer in ((0.3, False), (0.02, True)):
+        file = with_dilation(tiny_cgs, pixels, tmp_path / f"{pixels}.cgs")
+        assert export(file, tmp_path / f"{pixels}.ply", degree=0, refine=0).softer == softer

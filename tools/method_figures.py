@@ -25,7 +25,7 @@ from compgs.gaussians import Gaussians
 from compgs.metrics import psnr, to_8bit
 from compgs.model.hybrid_model import HybridModel
 from compgs.outputs import write_bytes
-from compgs.render import RasterSettings, local_camera, render
+from compgs.render import RasterSettings, local_camera, render, settings_of
 from compgs.render.rasterize import rasterize
 from compgs.scene import load_scene
 
@@ -119,7 +119,7 @@ def bits(model: HybridModel, content: FileContent, camera: Camera, components: d
     low, high = np.quantile(per_anchor, [0.05, 0.95])
     scaled = np.clip((per_anchor - low) / (high - low), 0, 1)
     colors = matplotlib.colormaps["viridis"](scaled[owner[index]])[:, :3].astype(np.float32)
-    colored = to_8bit(rasterize(replace(g, colors=colors), local, model_settings(model)).image)
+    colored = to_8bit(rasterize(replace(g, colors=colors), local, settings_of(model)).image)
     pictures = beside(
         [to_8bit(render(model, camera).image), colored],
         ["rendering", f"bits of the anchor: dark {low:.0f}, bright {high:.0f}"],
@@ -138,10 +138,6 @@ def bits(model: HybridModel, content: FileContent, camera: Camera, components: d
     canvas.paste(pictures, (0, 0))
     canvas.paste(chart, (pictures.width, 0))
     return canvas
-
-
-def model_settings(model: HybridModel) -> RasterSettings:
-    return RasterSettings(background=model.background)
 
 
 def component_sizes(data: bytes) -> dict[str, int]:

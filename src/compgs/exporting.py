@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
 from compgs import metrics
@@ -30,7 +31,7 @@ from compgs.model.degrees import MAX_DEGREE
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
 from compgs.outputs import check_output_file, write_bytes
-from compgs.render import Renderable, render
+from compgs.render import RasterSettings, Renderable, render, settings_of
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -40,6 +41,7 @@ FITTED_CAMERAS = 96  # of baking; fewer than the coefficients leave colors betwe
 COMPARED_CAMERAS = 12  # between the file's own, beside those: baking saw none of them
 LONGEST_SIDE = 800  # pixels, of cameras that baking looks through
 BUDGET_ROUNDS = 12  # of dropping splats until a file is small enough
+SOFTER = 0.5  # of what other programs dilate splats by; who has less is sharper to the eye
 LEAST_DEGREE = 1  # of harmonics, before splats are left out for a file to be small enough
 MOST_STEPS = 100_000  # of refining
 BUDGET_MARGIN = 0.995  # of the size aimed at: sizes are not quite proportional to the number of splats
@@ -55,6 +57,7 @@ class Exported:
     dropped: int  # splats that were left out for the file to be small enough
     psnr: tuple[float, ...]  # dB, 8-bit images, of each camera; infinite where nothing changed
     origin: tuple[float, float, float]  # world units: where positions in the file count from
+    softer: bool = False  # whether other programs draw the splats softer than the scene is
 
     @property
     def mean(self) -> float:
@@ -123,6 +126,7 @@ def export(
     compared = (*cameras, *between(cameras, COMPARED_CAMERAS, seed=1))
     changed = limits.change(model)
     steps = len(compared) + (len(fitted) + refine if changed else 0)
+    settings = as_others_draw(model, cameras)
     count = _counter(steps, progress)
 
     origin = (0.0, 0.0, 0.0) if kind in KEEP_WORLD_OFFSET else model.world_offset
@@ -133,13 +137,14 @@ def export(
         return write(_arrays(splats, model, kind))
 
     if changed:
-        baked, dropped = _limited(model, fitted, limits, refine, lambda b: len(written(b)), count)
+        baked, dropped = _limited(model, fitted, limits, refine, lambda b: len(written(b)), count, settings)
     else:
         baked, dropped = _splats_of(model, (), MAX_DEGREE, count), 0
     data = written(baked)
     psnr = tuple(_compared(model, _read_back(data, kind, model, chosen), compared, count))
     write_bytes(path, data)
-    return Exported(len(data), len(baked.importance), baked.splats.degree, dropped, psnr, origin)
+    sharp = settings_of(model).dilation_of(cameras[0]) < SOFTER * settings.dilation_of(cameras[0])
+    return Exported(len(data), len(baked.importance), baked.splats.degree, dropped, psnr, origin, sharp)
 
 
 @dataclass(frozen=True)
@@ -207,6 +212,7 @@ def _limited(
     refine: int,  # steps
     size: Callable[[Baked], int],  # bytes of a file
     count: Callable[[], None],
+    settings: RasterSettings,  # with which the splats are drawn
 ) -> tuple[Baked, int]:
     """The splats of a model within limits, and how many were left out."""
     baked = _splats_of(model, cameras, MAX_DEGREE if limits.degree is None else limits.degree, count)
@@ -216,7 +222,7 @@ def _limited(
     if degree < baked.splats.degree:
         # Anew: harmonics that are fitted alone are not those that are fitted with higher ones.
         baked = limits.by_number(_splats_of(model, cameras, degree, lambda: None))
-    baked = refine_splats(limits.by_bytes(baked, size), model, cameras, refine, count)
+    baked = refine_splats(limits.by_bytes(baked, size), model, cameras, refine, count, settings)
     # Fitted numbers may compress a little worse.
     baked = limits.by_bytes(baked, size)
     return baked, total - len(baked.importance)
@@ -235,6 +241,14 @@ def own_cameras(model: Renderable) -> list[Camera]:
         return list(model.viewpoints)
     around = surround(model.bounds[0])
     return [camera.moved(tuple(-x for x in model.world_offset)) for _, camera in around]
+
+
+def as_others_draw(model: Renderable, cameras: Sequence[Camera]) -> RasterSettings:
+    """How other programs draw splats in pictures of the cameras' size; so that they can be fitted in smaller ones."""
+    if model.angular_dilation is None:
+        return RasterSettings(background=model.background)
+    pixels = RasterSettings().dilation / median(camera.fx * camera.fy for camera in cameras)
+    return RasterSettings(background=model.background, angular_dilation=pixels)
 
 
 def smaller(camera: Camera) -> Camera:

@@ -83,6 +83,14 @@ def test_a_report_says_what_was_lost_and_left_out() -> None:
     ]
 
 
+def test_a_report_says_that_other_programs_draw_a_sharp_scene_softer() -> None:
+    done = Exported(100, 20, 0, 0, (40.0,), ORIGIN, softer=True)
+    assert (
+        "note: other programs draw splats softer than a.cgs is"
+        in report(Path("a.cgs"), Path("b.ply"), done)[-1]
+    )
+
+
 def test_a_lower_degree_is_not_advised_where_there_is_none() -> None:
     done = Exported(100, 20, 0, 30, (40.0,), ORIGIN)
     assert report(Path("a.cgs"), Path("b.ply"), done)[-1] == "30 of 50 splats were left out"

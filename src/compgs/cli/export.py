@@ -107,4 +107,9 @@ def report(source: Path, path: Path, exported: "Exported") -> list[str]:
         lines.append(
             f"note: positions count from {place}: {path.suffix} has no place for that; .ply and .glb do"
         )
+    if exported.softer:
+        lines.append(
+            f"note: other programs draw splats softer than {source.name} is, in pictures as small as its photographs: "
+            "docs/export.md, Sharpness"
+        )
     return lines
