@@ -82,8 +82,8 @@ def forged_header(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
 def spliced(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
     """Some sections from another file."""
     theirs = {section.number: section for section in unpack(other)}
-    spliced = [theirs.get(s.number, s) if rng.random() < 0.3 else s for s in unpack(data)]
-    return pack(spliced, version_of(data))
+    mixed = [theirs.get(s.number, s) if rng.random() < 0.3 else s for s in unpack(data)]
+    return pack(mixed, version_of(data))
 
 
 def forged_payload(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:

@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING
 
 from compgs import metrics
@@ -32,6 +31,7 @@ from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
 from compgs.outputs import check_output_file, write_bytes
 from compgs.render import RasterSettings, Renderable, render, settings_of
+from compgs.render.settings import DEFAULT_SETTINGS, as_angle
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -247,8 +247,8 @@ def as_others_draw(model: Renderable, cameras: Sequence[Camera]) -> RasterSettin
     """How other programs draw splats in pictures of the cameras' size; so that they can be fitted in smaller ones."""
     if model.angular_dilation is None:
         return RasterSettings(background=model.background)
-    pixels = RasterSettings().dilation / median(camera.fx * camera.fy for camera in cameras)
-    return RasterSettings(background=model.background, angular_dilation=pixels)
+    angle = as_angle(DEFAULT_SETTINGS.dilation, cameras)
+    return RasterSettings(background=model.background, angular_dilation=angle)
 
 
 def smaller(camera: Camera) -> Camera:

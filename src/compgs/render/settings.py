@@ -1,6 +1,8 @@
 """The conventions of rasterization: those of 3DGS and gsplat, so that a scene looks as it does elsewhere."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 
 from compgs.cameras import Camera
 
@@ -33,6 +35,11 @@ class RasterSettings:
 
 
 DEFAULT_SETTINGS = RasterSettings()
+
+
+def as_angle(pixels: float, cameras: Sequence[Camera]) -> float:
+    """`RasterSettings.angular_dilation` with which most cameras add so many pixels^2."""
+    return pixels / median(camera.fx * camera.fy for camera in cameras)
 
 
 def jacobian_limits(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:

@@ -8,14 +8,13 @@ learn what is as sharp as that; where few look, thin splats show themselves betw
 """
 
 from collections.abc import Sequence
-from statistics import median
 
 import numpy as np
 
 from compgs.cameras import Camera
 from compgs.codec.format import LARGEST_DILATION, SMALLEST_DILATION
 from compgs.config import Config
-from compgs.render.settings import LEAST_DILATION
+from compgs.render.settings import LEAST_DILATION, as_angle
 from compgs.training.few_views import fewness
 from compgs.training.own_residuals import FEW_ENOUGH, Limits
 
@@ -32,6 +31,6 @@ def dilation(config: Config, anchors: int, views: int) -> float:
 
 
 def angular_dilation(pixels: float, cameras: Sequence[Camera]) -> float:
-    """`RasterSettings.angular_dilation`, float32, with which most cameras add so many pixels^2."""
-    angle = pixels / median(camera.fx * camera.fy for camera in cameras)
-    return float(np.float32(min(max(angle, SMALLEST_DILATION), LARGEST_DILATION)))
+    """The same as an angle, as a file can hold it: float32."""
+    angle = min(max(as_angle(pixels, cameras), SMALLEST_DILATION), LARGEST_DILATION)
+    return float(np.float32(angle))
