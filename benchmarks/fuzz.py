@@ -27,6 +27,7 @@ from compgs.codec.fields import FieldReader, varint
 from compgs.codec.format import (
     FIRST_WITH_DILATION,
     FIRST_WITH_NEIGHBOURS,
+    FIRST_WITH_ROWS,
     LATENTS,
     NETWORKS,
     SCENE,
@@ -189,7 +190,7 @@ def forged_range(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
 
 
 def forged_network(rng: np.random.Generator, data: bytes, other: bytes) -> bytes:
-    """Flags and widths of networks and of their layers, or their number, changed; all checksums made right again."""
+    """Flags, widths and inertia of networks and layers, or their number, changed; all checksums made right again."""
     sections = unpack(data)
     scene = next(decode_scene(s.data, s.name, version_of(data)) for s in sections if s.number == SCENE)
     i = next(i for i, section in enumerate(sections) if section.number == NETWORKS)
@@ -208,6 +209,9 @@ def forged_network(rng: np.random.Generator, data: bytes, other: bytes) -> bytes
         if follows:
             places.append(reader.position)
             reader.bytes(1, "follow shift")
+        if version_of(data) >= FIRST_WITH_ROWS:
+            places.append(reader.position)
+            reader.bytes(1, "inertia")
     payload = bytearray(sections[i].data)
     for _ in range(rng.integers(1, 4)):
         place = int(rng.choice(places))

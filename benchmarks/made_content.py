@@ -18,6 +18,7 @@ from compgs.codec.content import (
     surroundings,
 )
 from compgs.codec.integer_network import FRACTION_BITS, Follow, IntegerLayer, IntegerNetwork
+from compgs.codec.rows import RowContext, chain_length
 from compgs.codec.tables import hyper_tables
 from compgs.ordering.order import canonical_order
 
@@ -63,6 +64,7 @@ def make_content(
     hidden: int = 8,  # width of their hidden layers
     symbols: bool = True,  # False: zero symbols, and networks that are sure of it
     angular_dilation: float | None = None,
+    row_context: bool = False,  # chains and inertia; only with an angular dilation
 ) -> FileContent:
     """Content whose symbols follow its own networks' predictions, as a trained model's do."""
     d = dimensions or make_dimensions()
@@ -83,6 +85,8 @@ def make_content(
             if shape.sees_neighbours:
                 follow = rng.integers(-600, 900, shape.channels).astype(np.int32)
                 prior = replace(prior, follow=Follow(follow, WEIGHT_SHIFT))
+            if row_context:
+                prior = replace(prior, rows=_row_context(rng, shape.channels))
             coded = code_group(
                 shape,
                 prior,
@@ -141,6 +145,11 @@ def make_coordinates(anchors: int, rng: np.random.Generator) -> np.ndarray:  # [
         points = np.rint(directions * radii[:, None]).astype(np.int32)
         found = np.unique(np.concatenate([found, points]), axis=0)
     return np.ascontiguousarray(found[rng.permutation(len(found))[:anchors]])
+
+
+def _row_context(rng: np.random.Generator, channels: int) -> RowContext:
+    chain = rng.integers(-24, 25, chain_length(channels)).astype(np.int32) if channels > 1 else None
+    return RowContext(chain, int(rng.integers(1, 20)))
 
 
 def _network(

@@ -11,8 +11,7 @@ import torch
 from hypothesis import settings
 
 from compgs.cameras import Camera
-from compgs.codec.encoder import to_content
-from compgs.codec.writer import write_content
+from compgs.codec.encoder import encoded
 from compgs.config import Config, ModelConfig
 from compgs.evaluation.camera_path import look_at, orbit
 from compgs.gaussians import Gaussians
@@ -117,7 +116,7 @@ def cgs_bytes() -> bytes:
         for elevation in (10.0, 40.0)
         for _, camera in orbit(positions, frames=6, width=64, height=48, elevation=elevation)
     )
-    return write_content(to_content(model))
+    return encoded(model, viewpoints=12)[0]
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ PUBLISHED = {
     "model.voxel_spacings": 1.0,  # (published: a number for each data set)
     "model.voxel_rate_exponent": 0.0,
     "model.reference_context": "hyperprior",
+    "model.row_context": False,
     "model.point_colors": False,
     "entropy.reference_hyper_dim": 4,
     "entropy.reference_step": 1.0,

@@ -5,12 +5,13 @@ python tools/describe_file.py tests/golden/tiny.cgs
 
 import struct
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 from compgs.codec.content import FileContent, Role
 from compgs.codec.format import (
     FIRST_WITH_DILATION,
+    FIRST_WITH_ROWS,
     HEADS,
     LATENTS,
     MASKS,
@@ -26,8 +27,9 @@ from compgs.codec.format import (
 from compgs.codec.integer_network import IntegerNetwork
 from compgs.codec.rans import CHUNK_SYMBOLS
 from compgs.codec.reader import group_names, read_latents
+from compgs.codec.rows import CHAIN_BITS
 from compgs.codec.sections import HEADS as HEAD_LAYOUTS
-from compgs.codec.weights import ADDS, RECTIFY, SHIFTS
+from compgs.codec.weights import ADDS, CHAINED, RECTIFY, SHIFTS, SKIP
 
 SCENE_FIELDS = (
     ("anchors", "I"),
@@ -115,10 +117,12 @@ def group(c: Cursor, index: int) -> Iterator[Row]:
     yield raw + steps, f"group {index}: `steps` {count}" + (f": {shown}" if count else "")
 
 
-def arrays(c: Cursor, count: int) -> Iterator[Row]:
-    for i in range(count):
+def arrays(c: Cursor, names: list[str]) -> Iterator[Row]:
+    """names: of the arrays; empty where the document has none."""
+    for i, name in enumerate(names):
         raw = c.take(2)
-        yield raw, f"array {i}: table {raw[0]}, {raw[1]} low bits"
+        named = f", {name}" if name else ""
+        yield raw, f"array {i}{named}: table {raw[0]}, {raw[1]} low bits"
     raw, size = c.varint()
     yield raw, f"`stream_bytes` {size}"
     inner = Cursor(c.take(size))
@@ -150,32 +154,47 @@ def tables(c: Cursor, count: int) -> Iterator[Row]:
         raw2, lowest = c.varint()
         yield raw + raw2, f"table {i}: {entries} entries from symbol {signed(lowest)} on"
     if count:
-        yield from arrays(c, 1)
+        yield from arrays(c, [""])
 
 
-def networks(c: Cursor, names: list[str], follow: list[bool]) -> Iterator[Row]:
+def networks(c: Cursor, names: list[str], follow: list[bool], version: int) -> Iterator[Row]:
     """follow: whether the means of each follow neighbours."""
-    total = 0
+    found: list[str] = []  # names of the arrays
     for name, follows in zip(names, follow, strict=True):
         raw, layers = c.varint()
         flags = c.take(1)
-        skip = ", skip" * flags[0]
-        yield raw + flags, f"network of the {name}: {plural(layers, 'layer')}{skip}"
+        chained = bool(flags[0] & CHAINED)
+        marks = ", skip" * bool(flags[0] & SKIP) + ", chain" * chained
+        yield raw + flags, f"network of the {name}: {plural(layers, 'layer')}{marks}"
         for i in range(layers):
-            total += 4
+            found += [""] * 4
             raw, outputs = c.varint()
             flags = c.take(1)
             marks = ", rectify" * bool(flags[0] & RECTIFY) + ", adds" * bool(flags[0] & ADDS)
             yield raw + flags, f"layer {i}: {outputs} outputs, shift {flags[0] & SHIFTS}{marks}"
         if follows:
-            total += 1
+            found.append(f"`follow` of the {name}")
             raw = c.take(1)
             yield raw, f"`follow_shift` {raw[0]}"
-    if total:
-        yield from arrays(c, total)
+        if version >= FIRST_WITH_ROWS:
+            raw = c.take(1)
+            yield raw, f"`inertia` {raw[0]}"
+        if chained:
+            found.append(f"`chain` of the {name}")
+    if found:
+        yield from arrays(c, found)
 
 
-def heads(c: Cursor) -> Iterator[Row]:
+def heads(c: Cursor, shapes: Mapping[str, tuple[int, ...]]) -> Iterator[Row]:
+    """Without names: the scene says which tensors there are."""
+    for name, shape in shapes.items():
+        raw, exponent = c.varint()
+        yield raw, f"`{name}`: shape {list(shape)}, exponent {signed(exponent)}"
+    yield from arrays(c, [f"`{name}`" for name in shapes])
+
+
+def named_heads(c: Cursor) -> Iterator[Row]:
+    """Of versions before `FIRST_WITH_ROWS`."""
     raw, count = c.varint()
     yield raw, f"`tensors` {count}"
     name = b""
@@ -194,7 +213,7 @@ def heads(c: Cursor) -> Iterator[Row]:
         more, exponent = c.varint()
         yield raw + more, f"rank {rank}, shape {sides}, exponent {signed(exponent)}"
     if count:
-        yield from arrays(c, count)
+        yield from arrays(c, [""] * count)
 
 
 def latents(c: Cursor, content: FileContent) -> Iterator[Row]:
@@ -231,14 +250,15 @@ def rows(data: bytes) -> Iterator[Row]:
     """(bytes, meaning) of all pieces of a file, in order."""
     content = read_latents(data)[0]
     d = content.dimensions
+    version = version_of(data)
     names = [f"{name} (group {i})" for i, name in enumerate(group_names(d)) if d.groups[i].has_network]
     readers: dict[int, Callable[[Cursor], Iterable[Row]]] = {
-        SCENE: lambda c: scene(c, version_of(data)),
+        SCENE: lambda c: scene(c, version),
         POSITIONS: payload,
         MASKS: payload,
         TABLES: lambda c: tables(c, d.table_count),
-        NETWORKS: lambda c: networks(c, names, d.networks_that_follow),
-        HEADS: heads,
+        NETWORKS: lambda c: networks(c, names, d.networks_that_follow, version),
+        HEADS: named_heads if version < FIRST_WITH_ROWS else lambda c: heads(c, d.head_shapes),
         LATENTS: lambda c: latents(c, content),
         METADATA: metadata,
     }
@@ -281,6 +301,11 @@ def values(data: bytes) -> str:
             lines.append(
                 f"| group {i}, follow, times 2^{part.prior.follow.shift} | {part.prior.follow.weight.tolist()} |"
             )
+        context = part.prior.rows
+        if context.inertia:
+            lines.append(f"| group {i}, inertia | {context.inertia} |")
+        if context.chain is not None:
+            lines.append(f"| group {i}, chain, times 2^{CHAIN_BITS} | {context.chain.tolist()} |")
     for name, tensor in content.heads:
         lines.append(f"| {name}, times 2^{tensor.exponent} | {tensor.values.tolist()} |")
     return "\n".join(lines)

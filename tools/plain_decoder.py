@@ -13,6 +13,7 @@ import zlib
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,9 @@ from typing import Any
 GAUSSIAN_TABLES = Path(__file__).parent.parent / "src" / "compgs" / "codec" / "gaussian_tables.bin"
 
 MAGIC = b"\x93CGS"
-VERSION = 4
+VERSION = 5
 OLDEST_VERSION = 2
+FIRST_WITH_NEIGHBOURS, FIRST_WITH_DILATION, FIRST_WITH_ROWS = 3, 4, 5
 OPTIONAL = 0x80
 MAX_SECTIONS = 64
 MAX_ANCHORS = 2**24
@@ -60,6 +62,11 @@ MAX_WEIGHTS = 2**22
 MAX_LOW_BITS = 26
 FOLLOW_LIMIT = 2**28
 NEAREST_WEIGHT = 2**24
+CHAIN_BITS = 6
+CHAIN_LIMIT = 2**12
+MAX_INERTIA = 63
+SIZE_OFFSET, SIZE_CAP = 1229, 4
+LARGEST_TABLE_SHIFT = 36
 
 SCENE, POSITIONS, GPCC, MASKS, TABLES, NETWORKS, HEADS, LATENTS = range(1, 9)
 METADATA, PADDING, VIEWPOINTS = 129, 130, 131
@@ -209,6 +216,20 @@ class Scene:
         inputs += 2 * group.takes_neighbours()
         return inputs, 2 * group.width(self.coupled_primitives)
 
+    def predictions(self) -> list[tuple[str, int, int, int]]:
+        """Of each network of the prediction: name, inputs, outputs and blocks."""
+        d = sum(group.channels for group in self.groups if group.role == REFERENCE)
+        seen = d + self.residual_dim  # f, g
+        viewed = d + 4 + self.residual_dim  # f, v, g
+        separate = [
+            ("translation", seen, 3, 1),
+            ("covariance", seen, 7, 1),
+            ("opacity", viewed, 1, 1),
+            ("color", viewed, 3, 2),
+        ]
+        paired = [("geometry", seen, 10, 1), ("appearance", viewed, 4, 1)]
+        return (separate, paired)[self.heads]
+
 
 def read_scene(data: bytes, version: int) -> Scene:
     fields = Fields(data, NAMES[SCENE])
@@ -224,7 +245,7 @@ def read_scene(data: bytes, version: int) -> Scene:
     view_distance_scale = fields.number("d", SMALLEST, LARGEST, "view_distance_scale")
     background = tuple(fields.number("f", -LARGEST, LARGEST, "background") for _ in range(3))
     dilation = None
-    if version >= 4:
+    if version >= FIRST_WITH_DILATION:
         dilation = fields.number("f", SMALLEST_DILATION, LARGEST_DILATION, "angular_dilation")
     groups: list[Group] = []
     for _ in range(fields.number("B", 1, MAX_GROUPS, "groups")):
@@ -241,7 +262,7 @@ def read_scene(data: bytes, version: int) -> Scene:
 def read_group(fields: Fields, version: int, before: list[Group], k: int) -> Group:
     role = fields.varint(0, 3, "role")
     channels = fields.varint(1, MOST_CHANNELS[role], "channels")
-    bits = len(before) + (1 if version == 2 else 2)
+    bits = len(before) + (2 if version >= FIRST_WITH_NEIGHBOURS else 1)
     context = fields.varint(0, 2**bits - 1, "context")
     count = fields.varint(0, channels, "steps")
     fields.require(count in ((0,) if role == SIDE else (1, channels)), f"{count} steps")
@@ -266,6 +287,11 @@ class Table:
 
     def entry(self, slot: int) -> int:
         return bisect_right(self.starts, slot) - 1
+
+    @cached_property
+    def expected_size(self) -> int:
+        """E, of a Gaussian table: the expected absolute value of a symbol, Q12."""
+        return sum(q * self.frequencies[q - self.lowest] for q in range(1, -self.lowest + 1)) // 8
 
 
 def gaussian_tables() -> list[Table]:
@@ -313,26 +339,81 @@ def table_of(fields: Fields, lowest: int, d: list[int]) -> Table:
 # ---- Streams
 
 
-def read_stream(fields: Fields, tables: list[Table]) -> list[int]:
+class Known:
+    """The tables of a stream's symbols, all known beforehand."""
+
+    def __init__(self, tables: list[Table]) -> None:
+        self.tables = tables
+
+    def __len__(self) -> int:
+        return len(self.tables)
+
+    def begin_chunk(self) -> None:
+        pass
+
+    def table(self, i: int) -> Table:
+        """Of symbol i of the stream; they are asked for in order."""
+        return self.tables[i]
+
+    def decoded(self, i: int, table: Table, entry: int) -> None:
+        pass
+
+
+class Inert(Known):
+    """Gaussian tables that move with the sizes of the symbols before them in their row (inertia)."""
+
+    # M(d), d = -LARGEST_TABLE_SHIFT ... LARGEST_TABLE_SHIFT
+    BOUNDS = tuple(
+        math.floor(2 ** (15 + (2 * d - 1) / 24)) for d in range(-LARGEST_TABLE_SHIFT, LARGEST_TABLE_SHIFT + 1)
+    )
+
+    def __init__(self, places: list[int], gaussian: list[Table], channels: int, inertia: int) -> None:
+        """places: of the tables that the network gives, among the Gaussian ones; channels: symbols of a row."""
+        super().__init__([gaussian[t] for t in places])
+        self.places, self.gaussian, self.channels, self.inertia = places, gaussian, channels, inertia
+
+    def begin_chunk(self) -> None:
+        self.seen = self.expected = 4096 * self.inertia
+        self.shift = 0
+
+    def table(self, i: int) -> Table:
+        if i % self.channels == 0:
+            self.begin_chunk()  # a row begins as a chunk does
+        return self.gaussian[clamp(self.places[i] + self.shift, 0, len(self.gaussian) - 1)]
+
+    def decoded(self, i: int, table: Table, entry: int) -> None:
+        e = self.tables[i].expected_size
+        most = SIZE_CAP * e
+        size = most if entry == table.escape else min(4096 * abs(table.lowest + entry), most)
+        self.seen += 4096 * size // (e + SIZE_OFFSET)
+        self.expected += 4096 * e // (e + SIZE_OFFSET)
+        # 32768 seen >= expected M(d)
+        at = bisect_right(self.BOUNDS, 32768 * self.seen // self.expected) - 1
+        self.shift = max(at, 0) - LARGEST_TABLE_SHIFT
+
+
+def read_stream(fields: Fields, tables: Known) -> list[int]:
     """One symbol for each of the tables."""
-    if not tables:
+    count = len(tables)
+    if not count:
         return []
-    chunks = [tables[i : i + CHUNK_SYMBOLS] for i in range(0, len(tables), CHUNK_SYMBOLS)]
+    chunks = [range(i, min(i + CHUNK_SYMBOLS, count)) for i in range(0, count, CHUNK_SYMBOLS)]
     words = [fields.varint(2, len(chunk) // 2 + 5, "words") for chunk in chunks]
-    escape_bytes = fields.varint(0, MAX_ESCAPE_BYTES * len(tables), "escape_bytes")
-    entries = []
-    for chunk, count in zip(chunks, words, strict=True):
-        entries += chunk_entries(fields, chunk, iter(fields.unpack(f"{count}I")))
+    escape_bytes = fields.varint(0, MAX_ESCAPE_BYTES * count, "escape_bytes")
+    entries: list[tuple[Table, int]] = []
+    for chunk, size in zip(chunks, words, strict=True):
+        entries += chunk_entries(fields, chunk, tables, iter(fields.unpack(f"{size}I")))
     escapes = Fields(fields.take(escape_bytes), fields.name)
-    symbols = [
-        escaped(escapes, table) if j == table.escape else table.lowest + j
-        for j, table in zip(entries, tables, strict=True)
-    ]
+    symbols = [escaped(escapes, table) if j == table.escape else table.lowest + j for table, j in entries]
     escapes.end()
     return symbols
 
 
-def chunk_entries(fields: Fields, chunk: list[Table], words: Iterator[int]) -> list[int]:
+def chunk_entries(
+    fields: Fields, chunk: range, tables: Known, words: Iterator[int]
+) -> list[tuple[Table, int]]:
+    """Of each symbol, its table and its entry there."""
+
     def word() -> int:
         value = next(words, None)
         fields.require(value is not None, "a chunk has too few words")
@@ -344,14 +425,17 @@ def chunk_entries(fields: Fields, chunk: list[Table], words: Iterator[int]) -> l
         states.append(low + 2**32 * word())
     fields.require(all(2**31 <= state < 2**63 for state in states), "a state is out of range")
     entries = []
-    for i, table in enumerate(chunk):
-        k = i % len(states)
+    tables.begin_chunk()
+    for i in chunk:
+        k = (i - chunk.start) % len(states)
         slot = states[k] % 65536
+        table = tables.table(i)
         j = table.entry(slot)
         states[k] = table.frequencies[j] * (states[k] // 65536) + slot - table.starts[j]
         if states[k] < 2**31:
             states[k] = 2**32 * states[k] + word()
-        entries.append(j)
+        tables.decoded(i, table, j)
+        entries.append((table, j))
     fields.require(next(words, None) is None, "a chunk has too many words")
     fields.require(all(state == 2**31 for state in states), "a state does not end where it began")
     return entries
@@ -375,7 +459,7 @@ def integer_arrays(fields: Fields, sizes: list[int], gaussian: list[Table]) -> l
     stream_bytes = fields.varint(0, what="stream_bytes")
     stream = Fields(fields.take(stream_bytes), fields.name)
     of_element = [setting for size, setting in zip(sizes, settings, strict=True) for _ in range(size)]
-    highs = read_stream(stream, [gaussian[table] for table, _ in of_element])
+    highs = read_stream(stream, Known([gaussian[table] for table, _ in of_element]))
     stream.end()
     needed = sum(low_bits for _, low_bits in of_element)
     fields.require(fields.left() == -(-needed // 8), f"{fields.left()} bytes for {needed} low bits")
@@ -402,53 +486,72 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Network:
+class NetworkHead:
+    """What the file says of a network before its numbers."""
+
     layers: list[Layer]
     skip: bool
+    has_chain: bool
     follow_shift: int
-    follow: list[int]  # of each channel; empty unless the group takes neighbours
+    inertia: int
+
+
+@dataclass(frozen=True)
+class Network:
+    head: NetworkHead
     weights: list[list[list[int]]]  # of each layer [outputs][inputs]
     biases: list[list[int]]
+    follow: list[int]  # of each channel; empty unless the group takes neighbours
+    chain: list[list[int]]  # of each channel, for those before it; empty unless there is one
 
 
 def read_networks(
-    data: bytes, scene: Scene, anchors: int, n: int, gaussian: list[Table]
+    data: bytes, version: int, scene: Scene, anchors: int, n: int, gaussian: list[Table]
 ) -> dict[int, Network]:
     """By group. n: the length of the file, which pays for the products with the anchors."""
     fields = Fields(data, NAMES[NETWORKS])
-    shapes = {i: read_layers(fields, scene, g) for i, g in enumerate(scene.groups) if g.context}
-    if not shapes:
+    heads = {i: read_network_head(fields, version, scene, g) for i, g in enumerate(scene.groups) if g.context}
+    if not heads:
         fields.end()
         return {}
-    layers = [layer for own, _, _ in shapes.values() for layer in own]
-    weights = sum(layer.inputs * layer.outputs for layer in layers)
+    layers = [layer for head in heads.values() for layer in head.layers]
+    products = anchors * sum(layer.inputs * layer.outputs for layer in layers)
     allowed = FREE_NETWORK_PRODUCTS + NETWORK_PRODUCTS_PER_BYTE * n
-    fields.require(anchors * weights <= allowed, f"{anchors * weights} products, expected up to {allowed}")
+    fields.require(products <= allowed, f"{products} products, expected up to {allowed}")
     sizes = []
-    for i, (own, _, _) in shapes.items():
-        for layer in own:
+    for i, head in heads.items():
+        for layer in head.layers:
             upper = (layer.outputs + 1) // 2
             lower = layer.outputs - upper
             sizes += [upper * layer.inputs, lower * layer.inputs, upper, lower]
+        channels = scene.groups[i].channels
         if scene.groups[i].takes_neighbours():
-            sizes.append(scene.groups[i].channels)
+            sizes.append(channels)
+        if head.has_chain:
+            sizes.append(channels * (channels - 1) // 2)
     fields.require(sum(sizes) <= MAX_WEIGHTS, f"{sum(sizes)} elements, expected up to {MAX_WEIGHTS}")
     arrays = iter(integer_arrays(fields, sizes, gaussian))
     networks = {}
-    for i, (own, skip, shift) in shapes.items():
-        parameters = [read_parameters(fields, layer, arrays) for layer in own]
+    for i, head in heads.items():
+        parameters = [read_parameters(fields, layer, arrays) for layer in head.layers]
+        weights, biases = map(list, zip(*parameters, strict=True))
         follow = next(arrays) if scene.groups[i].takes_neighbours() else []
         fields.require(all(abs(v) < FOLLOW_LIMIT for v in follow), "an element of follow")
-        weights, biases = map(list, zip(*parameters, strict=True))
-        networks[i] = Network(own, skip, shift, follow, weights, biases)
+        chain = next(arrays) if head.has_chain else []
+        fields.require(all(abs(v) < CHAIN_LIMIT for v in chain), "an element of chain")
+        # Row c of a triangle has c numbers.
+        triangle = [chain[c * (c - 1) // 2 :][:c] for c in range(scene.groups[i].channels)]
+        networks[i] = Network(head, weights, biases, follow, triangle if head.has_chain else [])
     return networks
 
 
-def read_layers(fields: Fields, scene: Scene, group: Group) -> tuple[list[Layer], bool, int]:
-    """Layers, skip and follow_shift of a network."""
+def read_network_head(fields: Fields, version: int, scene: Scene, group: Group) -> NetworkHead:
     inputs, outputs = scene.network_size(group)
     count = fields.varint(1, MAX_LAYERS, "layers")
-    skip = fields.number("B", 0, int(count > 1), "flags of a network") == 1
+    (flags,) = fields.unpack("B")
+    legal = int(count > 1) + 2 * int(version >= FIRST_WITH_ROWS and group.channels > 1)
+    fields.require(flags & ~legal == 0, f"flags of a network are {flags}, expected no bits but {legal}")
+    skip, has_chain = bool(flags & 1), bool(flags & 2)
     layers: list[Layer] = []
     for i in range(count):
         width = fields.varint(1, MAX_LAYER_WIDTH, "width")
@@ -463,7 +566,8 @@ def read_layers(fields: Fields, scene: Scene, group: Group) -> tuple[list[Layer]
         fields.require(not last or width == outputs, f"the last layer has {width} outputs, not {outputs}")
         layers.append(layer)
     follow_shift = fields.number("B", 0, MAX_SHIFT, "follow_shift") if group.takes_neighbours() else 0
-    return layers, skip, follow_shift
+    inertia = fields.number("B", 0, MAX_INERTIA, "inertia") if version >= FIRST_WITH_ROWS else 0
+    return NetworkHead(layers, skip, has_chain, follow_shift, inertia)
 
 
 def read_parameters(
@@ -488,8 +592,8 @@ def activation(v: int) -> int:
 def evaluate(network: Network, inputs: list[int]) -> list[int]:
     x = inputs = [activation(v) for v in inputs]
     before: list[int] = []  # what the layer before took
-    for i, layer in enumerate(network.layers):
-        if network.skip and i == len(network.layers) - 1:
+    for i, layer in enumerate(network.head.layers):
+        if network.head.skip and i == len(network.head.layers) - 1:
             x = x + inputs
         out = []
         for o, (row, bias) in enumerate(zip(network.weights[i], network.biases[i], strict=True)):
@@ -505,16 +609,15 @@ def evaluate(network: Network, inputs: list[int]) -> list[int]:
     return x
 
 
-def read_heads(data: bytes, coupled: int, n: int, gaussian: list[Table]) -> dict[str, dict[str, Any]]:
+Tensors = dict[str, dict[str, Any]]  # by name: shape, exponent, values
+
+
+def read_heads(
+    data: bytes, version: int, scene: Scene, coupled: int, n: int, gaussian: list[Table]
+) -> Tensors:
+    """coupled: primitives that the heads are for; n: the length of the file, which pays for the products."""
     fields = Fields(data, NAMES[HEADS])
-    tensors: dict[str, dict[str, Any]] = {}
-    name = b""
-    for _ in range(fields.varint(0, MAX_TENSORS, "tensors")):
-        name = read_name(fields, name)
-        sides = [fields.varint(0, MAX_LAYER_WIDTH, "side") for _ in range(fields.varint(0, MAX_RANK, "rank"))]
-        exponent = fields.signed(-MAX_EXPONENT, MAX_EXPONENT, "exponent")
-        fields.require(name.decode() not in tensors, f"{name.decode()} twice")
-        tensors[name.decode()] = {"shape": sides, "exponent": exponent}
+    tensors = tensors_of_scene(fields, scene) if version >= FIRST_WITH_ROWS else named_tensors(fields)
     if not tensors:
         fields.end()
         return {}
@@ -527,6 +630,44 @@ def read_heads(data: bytes, coupled: int, n: int, gaussian: list[Table]) -> dict
     for tensor, values in zip(tensors.values(), integer_arrays(fields, sizes, gaussian), strict=True):
         tensor["values"] = values
     return tensors
+
+
+def tensors_of_scene(fields: Fields, scene: Scene) -> Tensors:
+    """The scene says which there are; the file has their exponents."""
+    shapes: dict[str, list[int]] = {}
+    for network, inputs, outputs, blocks in scene.predictions():
+        own = {
+            "input_weight": [inputs, scene.width],
+            "input_bias": [scene.width],
+            "output_weight": [scene.width, outputs],
+            "output_bias": [outputs],
+            "skip_weight": [inputs, outputs],
+        }
+        for b in range(blocks):
+            for i in (1, 2):
+                own[f"blocks.{b}.weight{i}"] = [scene.width, scene.width]
+                own[f"blocks.{b}.bias{i}"] = [scene.width]
+        shapes |= {f"{network}.{name}": shape for name, shape in own.items()}
+    if all(group.role != RESIDUAL for group in scene.groups):
+        shapes["residuals"] = [scene.coupled_primitives, scene.residual_dim]
+    return {name: {"shape": shape, "exponent": read_exponent(fields)} for name, shape in shapes.items()}
+
+
+def named_tensors(fields: Fields) -> Tensors:
+    """Of versions 2 to 4."""
+    tensors: Tensors = {}
+    name = b""
+    for _ in range(fields.varint(0, MAX_TENSORS, "tensors")):
+        name = read_name(fields, name)
+        sides = [fields.varint(0, MAX_LAYER_WIDTH, "side") for _ in range(fields.varint(0, MAX_RANK, "rank"))]
+        exponent = read_exponent(fields)
+        fields.require(name.decode() not in tensors, f"{name.decode()} twice")
+        tensors[name.decode()] = {"shape": sides, "exponent": exponent}
+    return tensors
+
+
+def read_exponent(fields: Fields) -> int:
+    return fields.signed(-MAX_EXPONENT, MAX_EXPONENT, "exponent")
 
 
 def read_name(fields: Fields, before: bytes) -> bytes:
@@ -944,24 +1085,42 @@ def read_group_symbols(
     of each anchor, what its means follow; nothing unless the group takes neighbours.
     """
     group = model.scene.groups[i]
+    network = model.networks.get(i)
     means: list[int] = []
-    tables: list[Table] = []
+    places: list[int] = []  # of each symbol's table, among the Gaussian ones or the group's own
     for slots, x, near in zip(existing, inputs, around, strict=True):
         channels = [slot * group.channels + c for slot in slots for c in range(group.channels)]
-        if i in model.networks:
-            y = evaluate(model.networks[i], x)
+        if network:
+            y = evaluate(network, x)
             mean, scales = y[: len(y) // 2], y[len(y) // 2 :]
             if group.takes_neighbours():
-                mean = followed(model.networks[i], mean, near)
+                mean = followed(network, mean, near)
             means += [mean[c] for c in channels]
-            tables += [model.gaussian[clamp((scales[c] + 2048) >> 12, 0, 127)] for c in channels]
+            places += [clamp((scales[c] + 2048) >> 12, 0, 127) for c in channels]
         else:
             means += [0] * len(channels)
-            tables += [model.tables[i][c] for c in channels]
-    symbols = read_stream(fields, tables)
-    fields.require(all(abs(q) <= MAX_SYMBOL for q in symbols), f"a symbol beyond {MAX_SYMBOL}")
-    latents = [(q << 12) + mean for q, mean in zip(symbols, means, strict=True)]
+            places += channels
+    if network and network.head.inertia:
+        tables: Known = Inert(places, model.gaussian, group.channels, network.head.inertia)
+    else:
+        choice = model.gaussian if network else model.tables[i]
+        tables = Known([choice[place] for place in places])
+    symbols = steps = read_stream(fields, tables)
+    if network and network.chain:
+        steps = [q for row in rows(symbols, group.channels) for q in chained(network.chain, row)]
+    for name, values in (("symbol", symbols), ("step", steps)):
+        fields.require(all(abs(v) <= MAX_SYMBOL for v in values), f"a {name} beyond {MAX_SYMBOL}")
+    latents = [(q << 12) + mean for q, mean in zip(steps, means, strict=True)]
     return Decoded(rows(symbols, group.channels), rows(latents, group.channels))
+
+
+def chained(chain: list[list[int]], row: list[int]) -> list[int]:
+    """The steps that a row's symbols give."""
+    steps: list[int] = []
+    for s, factors in zip(row, chain, strict=True):
+        total = sum(f * q for f, q in zip(factors, steps, strict=True))
+        steps.append(s + ((total + 2 ** (CHAIN_BITS - 1)) >> CHAIN_BITS))
+    return steps
 
 
 @dataclass(frozen=True)
@@ -978,7 +1137,7 @@ class Earlier:
 
 def followed(network: Network, outputs: list[int], around: list[int]) -> list[int]:
     """An anchor's means."""
-    s = network.follow_shift
+    s = network.head.follow_shift
     half = 2 ** (s - 1) if s > 0 else 0
     means = []
     for output, b, f, v in zip(outputs, network.biases[-1], network.follow, around, strict=False):
@@ -1177,8 +1336,8 @@ def decode(data: bytes, prefix: bool = False) -> dict[str, Any]:
 
     prefix: the file may end early; of the anchors, those of the ranges that are there.
 
-    Of each group: `symbols`, a row an anchor, with role 3 a row a slot of an anchor and zeros where nothing exists;
-    `latents` in Q12, a row an anchor, with role 3 a row a coupled primitive that exists.
+    Of each group: `symbols` of its streams, a row an anchor, with role 3 a row a slot of an anchor and zeros where
+    nothing exists; `latents` in Q12, a row an anchor, with role 3 a row a coupled primitive that exists.
     """
     file = read_file(data, prefix)
     sections = file.sections
@@ -1188,8 +1347,8 @@ def decode(data: bytes, prefix: bool = False) -> dict[str, Any]:
     anchors = sum(head.anchors for head in heads) if prefix else scene.anchors
     coupled = sum(head.coupled for head in heads) if prefix else scene.coupled
     check_symbols(scene, anchors, len(data))
-    model = read_model(sections, scene, anchors, len(data))
-    tensors = read_heads(sections[HEADS], coupled, len(data), model.gaussian)
+    model = read_model(file, scene, anchors, len(data))
+    tensors = read_heads(sections[HEADS], file.version, scene, coupled, len(data), model.gaussian)
     if GPCC in sections:
         raise MissingDependency("positions (G-PCC): this decoder has no G-PCC")
     positions = read_positions(sections[POSITIONS], scene.anchors)
@@ -1229,10 +1388,10 @@ def check_symbols(scene: Scene, anchors: int, n: int) -> None:
     require(anchors * width <= allowed, "scene", f"{anchors * width} symbols, expected up to {allowed}")
 
 
-def read_model(sections: dict[int, bytes], scene: Scene, anchors: int, n: int) -> Model:
+def read_model(file: File, scene: Scene, anchors: int, n: int) -> Model:
     gaussian = gaussian_tables()
-    tables = read_tables(sections[TABLES], scene, gaussian)
-    networks = read_networks(sections[NETWORKS], scene, anchors, n, gaussian)
+    tables = read_tables(file.sections[TABLES], scene, gaussian)
+    networks = read_networks(file.sections[NETWORKS], file.version, scene, anchors, n, gaussian)
     return Model(scene, tables, networks, gaussian)
 
 

@@ -84,6 +84,9 @@ class ModelConfig:
     # the paper; training pays by a hyperprior, which the file does not hold), a hyperprior (Sec. 3.3), or one mean a
     # channel
     reference_context: Literal["neighbours", "hyperprior", "none"] = "neighbours"
+    # whether symbols of an anchor, or of a coupled primitive, say something about its later ones in the file (not in
+    # the paper; training pays for each by itself)
+    row_context: bool = True
     # networks are narrower, their weights of fewer bits, than `width` and `head_bits` say, and there is no such
     # context, where networks would be a sixth of the file and more: a large lambda and few anchors, or a small file
     # that is asked for (not in the paper)
@@ -246,7 +249,8 @@ class TrainingConfig:
     exposure: bool = False
     # of the primitives, that a step does without, where training views are few
     left_out: Annotated[float, Range(0, 0.5)] = 0.2
-    # cameras of training views that the file keeps, to look from; 0: none
+    # cameras of training views that the file keeps to look from, at most: one for each 100 anchors, and three at
+    # least; 0: none
     viewpoints: Annotated[int, Range(0, MAX_VIEWPOINTS)] = 12
     # minutes between two checkpoints; one is also written when the run is interrupted
     checkpoint_minutes: Annotated[float, Range(0, 1e6, above=True, below=True)] = 5.0

@@ -10,7 +10,8 @@ from compgs.codec import decode, encode
 from compgs.codec.content import Role, cross_entropy_bits
 from compgs.codec.encoder import encoded, integer_network, to_content
 from compgs.codec.integer_network import IntegerNetwork, entropy_parameters, evaluate
-from compgs.codec.reader import file_info, group_names, read_content
+from compgs.codec.reader import file_info, group_names, read_content, read_latents
+from compgs.codec.viewpoint_cameras import kept_viewpoints
 from compgs.codec.writer import write_content
 from compgs.config import Config, EntropyConfig, ModelConfig
 from compgs.entropy.contexts import Hyperprior
@@ -40,12 +41,18 @@ def config_of(blocks: int, residuals: bool = True, width: int = 16, context: Any
     )
 
 
-def made_model(anchors: int = 400, seed: int = 0, config: Config | None = None) -> TrainedModel:
+DILATION = 2.0**-20
+
+
+def made_model(
+    anchors: int = 400, seed: int = 0, config: Config | None = None, dilation: float | None = DILATION
+) -> TrainedModel:
     """Plausible latents without a training: hyperpriors and references that mean something."""
     rng = np.random.default_rng(seed)
     coordinates = np.unique(rng.integers(-60, 60, (anchors, 3)), axis=0).astype(np.int32)
     torch.manual_seed(seed)
     model = TrainedModel(config or OWN_RESIDUALS, torch.from_numpy(coordinates), 0.02, 5.0, (0.0, 0.0, 0.0))
+    model.angular_dilation = dilation
     with torch.no_grad():
         model.references.normal_(0, 1.5)
         model.residuals.add_(torch.randn_like(model.residuals))
@@ -93,8 +100,8 @@ def test_the_decoded_scene_is_the_one_that_training_rendered(tmp_path, blocks, c
 
 @pytest.mark.parametrize("blocks", [0, 2])
 def test_bits_match_the_files_sections_within_one_percent(blocks):
-    """Streams above 10 kB."""
-    model = made_model(7000, config=config_of(blocks))
+    """Streams above 10 kB, whose rows say nothing: training pays for each symbol by itself."""
+    model = made_model(7000, config=config_of(blocks), dilation=None)
     with torch.no_grad():
         for hyperprior in (model.entropy.reference_context, model.entropy.residual_hyperprior):
             if isinstance(hyperprior, Hyperprior):
@@ -179,7 +186,7 @@ def test_a_damaged_file_is_named_when_it_is_decoded(tmp_path):
 
 
 def test_heads_of_another_layout_are_refused(tmp_path):
-    content = to_content(made_model())
+    content = to_content(made_model(dilation=None))  # later versions have no names
     renamed = tuple((f"x{name}", tensor) for name, tensor in content.heads)
     path = tmp_path / "a.cgs"
     path.write_bytes(write_content(replace(content, heads=renamed)))
@@ -251,7 +258,7 @@ def test_own_residuals_leave_no_tensor_of_shared_ones():
 
 
 def test_shared_residuals_of_another_shape_are_refused(tmp_path):
-    content = to_content(made_model(50, config=Config()))
+    content = to_content(made_model(50, config=Config(), dilation=None))
     path = tmp_path / "a.cgs"
     for shape in ((8, 5), (40,)):
         heads = tuple(
@@ -347,7 +354,8 @@ def test_an_entropy_model_of_every_kind_is_written_as_the_paper_has_it():
 
 
 @pytest.mark.parametrize("config", [OWN_RESIDUALS, SHARED])
-def test_each_network_is_evaluated_once_for_each_block_of_rows(config, tmp_path, monkeypatch):
+def test_each_network_is_evaluated_once_for_each_block_of_rows(config, monkeypatch):
+    """And once more where it got a chain, whose tables are others."""
     seen = []
 
     def counted(network, x, mask=None):
@@ -356,8 +364,11 @@ def test_each_network_is_evaluated_once_for_each_block_of_rows(config, tmp_path,
 
     monkeypatch.setattr(content_module, "entropy_parameters", counted)
     model = made_model(900, config=config)  # three ranges in the file
-    encode(model, tmp_path / "a.cgs")
-    assert len({network for network, _ in seen}) == len(seen) == len(model.entropy.coded_networks)
+    content = encoded(model)[1]
+    chains = sum(
+        isinstance(g.prior, IntegerNetwork) and g.prior.rows.chain is not None for g in content.groups
+    )
+    assert len({network for network, _ in seen}) == len(seen) == len(model.entropy.coded_networks) + chains
     assert {rows for _, rows in seen} == {int(model.mask.any(1).sum())}
 
 
@@ -389,3 +400,29 @@ def test_a_model_that_lost_channels_has_its_own_dimensions(tmp_path):
     assert (d.reference_dim, d.coupled_primitives, model.config.model.reference_dim) == (16, 5, 32)
     assert model.entropy.channels["reference"] == 16
     assert encoded(model)[1].dimensions.reference_dim == 16
+
+
+def test_rows_that_say_something_make_a_smaller_file_of_the_same_scene(tmp_path):
+    """Log scales that go together, references that are large or small together; `model.row_context` turns it off."""
+    models = []
+    for row_context in (True, False):
+        config = Config(model=ModelConfig(residuals=False, row_context=row_context))
+        model = made_model(2000, config=config)
+        with torch.no_grad():
+            model.log_scales.add_(2 * torch.randn(model.anchors, 1))
+            model.references.mul_(2.0 ** torch.randn(model.anchors, 1))
+            model.entropy.fit_covariance_prior(model.log_scales)
+        models.append(model)
+    (data, content), (plain, plain_content) = map(encoded, models)
+    assert len(data) < 0.9 * len(plain)
+    assert content.group(Role.REFERENCE).prior.rows.inertia > 0
+    assert content.group(Role.LOG_SCALES).prior.rows.chain is not None
+    assert content.group(Role.REFERENCE).prior.rows.chain is None
+    assert all(group.prior.rows.inertia == 0 for group in plain_content.groups)
+    for ours, theirs in zip(read_latents(data)[1], read_latents(plain)[1], strict=True):
+        assert np.array_equal(ours, theirs)
+
+
+def test_small_files_keep_fewer_viewpoints_and_none_keeps_more_than_was_asked_for():
+    assert [kept_viewpoints(12, anchors) for anchors in (1, 250, 500, 5000)] == [3, 3, 5, 12]
+    assert kept_viewpoints(2, 10) == 2 and kept_viewpoints(0, 5000) == 0

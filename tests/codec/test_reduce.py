@@ -30,10 +30,13 @@ NEIGHBOURS = (
 )
 
 
-@pytest.fixture(scope="module", params=["paper", "neighbours"])
+@pytest.fixture(scope="module", params=["paper", "neighbours", "rows"])
 def content(request: pytest.FixtureRequest) -> FileContent:
-    groups = NEIGHBOURS if request.param == "neighbours" else paper_groups()
-    return read_content(write_content(make_content(900, 4, make_dimensions(10, groups))))
+    groups = paper_groups() if request.param == "paper" else NEIGHBOURS
+    rows = request.param == "rows"
+    dilation = 2.0**-20 if rows else None
+    made = make_content(900, 4, make_dimensions(10, groups), angular_dilation=dilation, row_context=rows)
+    return read_content(write_content(made))
 
 
 def kept_anchors(content: FileContent, kept: np.ndarray) -> np.ndarray:
@@ -80,15 +83,15 @@ def test_the_content_that_was_given_stays_as_it_was(content: FileContent) -> Non
 SIX_STEPS = (0.125, 0.15, 0.1, 0.2, 0.25, 0.175)
 
 
-@pytest.fixture(scope="module", params=["one step", "six steps", "blocks"])
+@pytest.fixture(scope="module", params=["one step", "six steps", "blocks", "rows"])
 def any_content(request: pytest.FixtureRequest) -> FileContent:
     groups = list(paper_groups())
     if request.param == "six steps":
         groups[2] = GroupShape(Role.LOG_SCALES, 6, SIX_STEPS, (1,))
-    blocks = 2 if request.param == "blocks" else 0
-    return read_content(
-        write_content(make_content(600, 4, make_dimensions(10, tuple(groups)), blocks=blocks))
-    )
+    blocks, rows = 2 if request.param == "blocks" else 0, request.param == "rows"
+    dimensions, dilation = make_dimensions(10, tuple(groups)), 2.0**-20 if rows else None
+    made = make_content(600, 4, dimensions, blocks=blocks, angular_dilation=dilation, row_context=rows)
+    return read_content(write_content(made))
 
 
 @pytest.mark.parametrize("ratio", [2.0, 3.0, 5.0])

@@ -1,5 +1,7 @@
 """Arrays of integers, networks and heads: round trips, size, refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,6 +10,7 @@ from hypothesis.extra import numpy as hnp
 
 from compgs.codec.fields import FieldReader, varint
 from compgs.codec.integer_network import IntegerLayer, IntegerNetwork
+from compgs.codec.rows import RowContext
 from compgs.codec.weights import (
     ADDS,
     MAX_WEIGHTS,
@@ -16,9 +19,11 @@ from compgs.codec.weights import (
     QuantizedTensor,
     decode_arrays,
     decode_heads,
+    decode_known_heads,
     decode_networks,
     encode_arrays,
     encode_heads,
+    encode_known_heads,
     encode_networks,
 )
 from compgs.errors import CorruptSection, NotEncodable
@@ -105,16 +110,17 @@ def test_no_networks_take_no_bytes() -> None:
         decode_networks(b"\0", "entropy networks", [])
 
 
-def network_bytes(*layers: tuple[int, int], flags: int = 0) -> bytes:
-    """The beginning of a network's section: (width, flags) of its layers."""
-    return bytes([len(layers), flags]) + b"".join(varint(width) + bytes([f]) for width, f in layers)
+def network_bytes(*layers: tuple[int, int], flags: int = 0, inertia: int = 0) -> bytes:
+    """The fields of a network: its flags, (width, flags) of its layers, its inertia."""
+    widths = b"".join(varint(width) + bytes([f]) for width, f in layers)
+    return bytes([len(layers), flags]) + widths + bytes([inertia])
 
 
 @pytest.mark.parametrize(
     ("data", "complaint"),
     [
         (network_bytes((4, 0), flags=1), "flags of network 0 are 1"),
-        (network_bytes((4, 0), (4, 0), flags=2), "flags of network 0 are 2"),
+        (network_bytes((4, 0), (4, 0), flags=4), "flags of network 0 are 4"),
         (network_bytes((4, 0), (4, 0), flags=0x80), "flags of network 0 are 128"),
         (network_bytes((4, RESERVED)), "layer 0 of network 0: flags are 0x20"),
         (network_bytes((3, RECTIFY), (4, RESERVED | 5)), "layer 1 of network 0: flags are 0x25"),
@@ -133,6 +139,44 @@ def network_bytes(*layers: tuple[int, int], flags: int = 0) -> bytes:
 def test_absurd_networks_are_refused_by_name(data: bytes, complaint: str) -> None:
     with pytest.raises(CorruptSection, match=f"entropy networks.*{complaint}"):
         decode_networks(data, "entropy networks", [(3, 4)])
+
+
+def chained_bytes(channels: int, inertia: int = 3, largest: int = 5, flags: int = 2) -> bytes:
+    """The section of one linear network of one input and a chain."""
+    chain = np.full(channels * (channels - 1) // 2, largest, np.int32)
+    halves = [np.zeros((channels, 1), np.int32)] * 2 + [np.zeros(channels, np.int32)] * 2
+    fields = network_bytes((2 * channels, 0), flags=flags, inertia=inertia)
+    return fields + encode_arrays([*halves, chain])
+
+
+def test_chains_and_inertia_come_back() -> None:
+    (network,) = decode_networks(chained_bytes(3), "entropy networks", [(1, 6)])
+    assert network.rows.inertia == 3 and network.rows.chain.tolist() == [5, 5, 5]
+    assert encode_networks([network]) == chained_bytes(3)
+    (plain,) = decode_networks(encode_networks([replace(network, rows=RowContext())]), "x", [(1, 6)])
+    assert plain.rows == RowContext()
+    # With two slots of a coupled primitive the network has twice as many outputs as the group has channels.
+    halves = [np.zeros((6, 1), np.int32)] * 2 + [np.zeros(6, np.int32)] * 2
+    data = network_bytes((12, 0), flags=2) + encode_arrays([*halves, np.array([1, 2, 3], np.int32)])
+    (of_slots,) = decode_networks(data, "entropy networks", [(1, 12)], channels=[3])
+    assert of_slots.rows.chain.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("data", "version", "complaint"),
+    [
+        (chained_bytes(3, inertia=64), 5, "inertia is 64, expected 0 to 63"),
+        (chained_bytes(3, largest=-4096), 5, "an element of the chain reaches 4096"),
+        (chained_bytes(1), 5, "flags of network 0 are 2"),
+        (chained_bytes(3, flags=3), 5, "flags of network 0 are 3"),
+        (chained_bytes(3), 4, "flags of network 0 are 2"),
+        (chained_bytes(3)[:-1], 5, "low bits|weights|words|bytes"),
+    ],
+)
+def test_absurd_chains_and_inertia_are_refused_by_name(data: bytes, version: int, complaint: str) -> None:
+    sizes = [(1, 2 if data == chained_bytes(1) else 6)]
+    with pytest.raises(CorruptSection, match=f"entropy networks.*({complaint})"):
+        decode_networks(data, "entropy networks", sizes, version=version)
 
 
 def test_networks_that_could_be_inexact_are_refused_when_they_are_read() -> None:
@@ -218,6 +262,29 @@ def test_heads_beyond_the_limits_are_refused_before_anything_is_written() -> Non
     ]:
         with pytest.raises(NotEncodable, match=complaint):
             encode_heads(heads)
+
+
+SHAPES = {"a.weight": (3, 2), "a.bias": (2,), "none": (0, 4)}
+
+
+def test_heads_that_the_scene_knows_take_no_names() -> None:
+    rng = np.random.default_rng(0)
+    tensors = [
+        QuantizedTensor(rng.integers(-60, 60, s).astype(np.int32), e) for e, s in enumerate(SHAPES.values())
+    ]
+    data = encode_known_heads(tensors)
+    read = decode_known_heads(data, "prediction heads", SHAPES)
+    assert [name for name, _ in read] == list(SHAPES)
+    for (_, a), b in zip(read, tensors, strict=True):
+        assert a.exponent == b.exponent and np.array_equal(a.values, b.values)
+    assert len(data) < len(encode_heads(read)) - len("a.weight" + "bias" + "none")
+    for size in range(len(data)):
+        with pytest.raises(CorruptSection, match="prediction heads"):
+            decode_known_heads(data[:size], "prediction heads", SHAPES)
+    with pytest.raises(CorruptSection, match=r"exponent of a\.weight is 63"):
+        decode_known_heads(b"\x7e" + data[1:], "prediction heads", SHAPES)
+    with pytest.raises(NotEncodable, match="exponent"):
+        encode_known_heads([replace(tensors[0], exponent=-63)])
 
 
 @pytest.mark.parametrize(

@@ -69,14 +69,20 @@ def test_what_was_trained_is_what_the_file_decodes_to(trained: Trainer, tmp_path
     """Anchor by anchor: neighbours change what a latent costs, and not what it is."""
     encode(trained.model, tmp_path / "a.cgs")
     info = file_info((tmp_path / "a.cgs").read_bytes())
-    assert info.version == 4 and len(info.ranges) > 1
+    assert info.version == 5 and len(info.ranges) > 1
     mine, theirs = trained.model.as_hybrid_model().primitives, decode(tmp_path / "a.cgs").primitives
     rows = {tuple(p): i for i, p in enumerate(mine.positions.tolist())}
     order = [rows[tuple(p)] for p in theirs.positions.tolist()]
     np.testing.assert_allclose(theirs.references, mine.references[order], atol=1e-3)
 
 
-def test_the_estimated_size_is_that_of_the_files_streams(trained: Trainer) -> None:
+def test_the_estimated_size_is_that_of_the_files_streams_whose_rows_say_nothing(
+    trained: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = trained.model.config
+    monkeypatch.setattr(
+        trained.model, "config", replace(config, model=replace(config.model, row_context=False))
+    )
     data, _ = encoded(trained.model)
     sections = {section.name: section.bytes for section in file_info(data).sections}
     estimated = trained.model.estimated_bits()

@@ -7,5 +7,6 @@ export { setTables } from "./mixing";
 export { setGrid, walkOctree } from "./octree";
 export { decodeMasks } from "./masks";
 export { decodeChunk } from "./rans";
+export { setRowTables } from "./rows";
 export { applyLayer } from "./networks";
 export { runCoupled } from "./coupled_mlp";

@@ -1,10 +1,17 @@
 /** Chunks of a stream: src/codec/rans.ts. */
 
+import { learn, shifted, startRows } from "./rows";
+
 const ESCAPED: i32 = i32.MIN_VALUE;
 const INITIAL: u64 = 1 << 31;
 const SINGLE_STATE_SYMBOLS = 1 << 18;
 
-/** 0, or the number of what is wrong: 1 too few words, 2 words left over, 3 a state's begin, 4 a state's end. */
+/**
+ * 0, or the number of what is wrong: 1 too few words, 2 words left over, 3 a state's begin, 4 a state's end.
+ *
+ * With `inertia` tables shift within rows of `channels` symbols, of which the chunk's first is at `firstColumn`:
+ * `choices` then become those that were used.
+ */
 export function decodeChunk(
   words: usize,
   wordBytes: i32,
@@ -17,6 +24,9 @@ export function decodeChunk(
   choices: usize, // [symbols] u8
   symbols: usize, // [symbols] i32
   count: i32,
+  channels: i32,
+  inertia: i32,
+  firstColumn: i32,
 ): i32 {
   const end = words + wordBytes;
   const isDouble = count >= SINGLE_STATE_SYMBOLS;
@@ -26,9 +36,11 @@ export function decodeChunk(
   let state = load<u64>(words);
   let other = isDouble ? load<u64>(words, 8) : INITIAL;
   if (<i64>state < <i64>INITIAL || <i64>other < <i64>INITIAL) return 3;
+  if (inertia) startRows(channels, inertia, firstColumn);
   for (let i = 0; i < count; i++) {
     const slot = <i32>(state & 0xffff);
-    const table = <usize>load<u8>(choices + i);
+    const given: i32 = load<u8>(choices + i);
+    const table = <usize>(inertia ? shifted(given) : given);
     const first = <usize>load<i32>(base + (table << 2));
     const last = load<i32>(entries + (table << 2)) - 1;
     let j: i32 = load<u16>(hints + (((table << 8) + (slot >> 8)) << 1));
@@ -42,7 +54,13 @@ export function decodeChunk(
       state = (state << 32) | <u64>load<u32>(next);
       next += 4;
     }
-    store<i32>(symbols + (<usize>i << 2), j === last ? ESCAPED : load<i32>(lowest + (table << 2)) + j);
+    const isEscaped = j === last;
+    const symbol = load<i32>(lowest + (table << 2)) + j;
+    store<i32>(symbols + (<usize>i << 2), isEscaped ? ESCAPED : symbol);
+    if (inertia) {
+      store<u8>(choices + i, <u8>table);
+      learn(given, isEscaped, symbol);
+    }
     if (isDouble) {
       const turn = state;
       state = other;

@@ -14,6 +14,7 @@ import {
   STEP_NODE,
   TOUCHING,
 } from "./codec/octree_grid.ts";
+import { rowTables } from "./codec/rows.ts";
 import { CorruptSection } from "./errors.ts";
 
 interface Exports {
@@ -23,6 +24,7 @@ interface Exports {
   release(to: number): void;
   setTables(...tables: number[]): void;
   setGrid(...tables: number[]): void;
+  setRowTables(...tables: number[]): void;
   walkOctree(...arguments_: number[]): number;
   decodeMasks(...arguments_: number[]): number;
   decodeChunk(...arguments_: number[]): number;
@@ -65,6 +67,8 @@ class WasmKernels implements Kernels {
       this.put(STEP_NODE),
       this.put(STEP_CHILD),
     );
+    const { expected, seen, seenBase, ratios } = rowTables();
+    wasm.setRowTables(this.put(expected), this.put(seen), this.put(seenBase), this.put(ratios));
   }
 
   walkOctree(payload: Uint8Array, start: number, anchors: number, depth: number, section: string) {
@@ -88,7 +92,7 @@ class WasmKernels implements Kernels {
     });
   }
 
-  decodeChunk: Kernels["decodeChunk"] = (words, tables, choices, symbols, section) => {
+  decodeChunk: Kernels["decodeChunk"] = (words, tables, choices, symbols, rows, section) => {
     this.within(() => {
       const { base, entries, lowest, frequencies, cumulated, hints } = tables;
       const places = [base, entries, lowest, frequencies, cumulated, hints].map((table) => this.put(table));
@@ -101,9 +105,13 @@ class WasmKernels implements Kernels {
         chosen,
         out,
         symbols.length,
+        rows?.channels ?? 0,
+        rows?.inertia ?? 0,
+        rows?.first ?? 0,
       );
       if (problem) throw new CorruptSection(`${section}: ${CHUNK_PROBLEMS[problem]}`);
       symbols.set(new Int32Array(this.wasm.memory.buffer, out, symbols.length));
+      if (rows) choices.set(new Uint8Array(this.wasm.memory.buffer, chosen, choices.length));
     });
   };
 

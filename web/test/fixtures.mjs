@@ -12,7 +12,7 @@ export const compgs = await import(pathToFileURL(join(built, "compgs.js")));
 const GOLDEN = fileURLToPath(new URL("../../tests/golden", import.meta.url));
 /** Made by make_fixtures.py; without it only the golden files are looked at. */
 export const FIXTURES = process.env.CGS_FIXTURES ?? "";
-const VERSIONS = [2, 3, 4];
+const VERSIONS = [2, 3, 4, 5];
 const ROLES = ["side", "reference", "log scales", "residual"];
 
 /** [name, bytes, hashes] of the golden files of the versions that are read. */

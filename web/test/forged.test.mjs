@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { crc32 } from "node:zlib";
+import * as encoding from "./encoding.mjs";
 import { compgs, goldenFiles, hashesOf } from "./fixtures.mjs";
 
 const { Predictor, decode } = compgs;
@@ -26,28 +26,8 @@ const viewpoints = (rotation) => {
   return bytes;
 };
 
-function sectionsOf(bytes) {
-  const count = bytes[6];
-  let at = 11 + 9 * count;
-  return Array.from({ length: count }, (_, i) => {
-    const length = bytes.readUInt32LE(8 + 9 * i);
-    at += length;
-    return { number: bytes[7 + 9 * i], payload: bytes.subarray(at - length, at) };
-  });
-}
-
-function fileOf(sections, version = files[0].bytes[4]) {
-  const head = Buffer.alloc(7 + 9 * sections.length);
-  head.set([0x93, 0x43, 0x47, 0x53, version, 0, sections.length]);
-  sections.forEach(({ number, payload }, i) => {
-    head[7 + 9 * i] = number;
-    head.writeUInt32LE(payload.length, 8 + 9 * i);
-    head.writeUInt32LE(crc32(payload), 12 + 9 * i);
-  });
-  const check = Buffer.alloc(4);
-  check.writeUInt32LE(crc32(head));
-  return Buffer.concat([head, check, ...sections.map(({ payload }) => payload)]);
-}
+const { sectionsOf } = encoding;
+const fileOf = (sections, version = files[0].bytes[4]) => encoding.fileOf(sections, version);
 
 /** Of each group that a scene section of version 2 or 3 describes, its role and where its context is. */
 function groupsOf(scene) {
@@ -70,6 +50,8 @@ const paper = sectionsOf(paperBytes);
 // A file of version 4.
 const { bytes: dilatedBytes, hashes: dilatedHashes } = goldenFiles().find(({ name }) => name === "dilated");
 const dilated = sectionsOf(dilatedBytes);
+// A file of version 5.
+const { bytes: rowsBytes } = goldenFiles().find(({ name }) => name === "rows");
 const without = (number) => original.filter((section) => section.number !== number);
 const withOne = (number, payload) => [...without(number), { number, payload: Buffer.from(payload) }];
 const refuses = (sections, name, message, options) =>
@@ -82,12 +64,13 @@ test("what was taken apart is put together as it was", () => {
   assert.deepEqual(fileOf(original), Buffer.from(files[0].bytes));
 });
 
-test("a file is of version 2, 3 or 4", () => {
+test("a file is of one of the versions 2 to 5", () => {
   for (const version of [2, 3]) {
     assert.deepEqual(hashesOf(decode(fileOf(paper, version))), paperHashes);
   }
   assert.deepEqual(hashesOf(decode(fileOf(dilated, 4))), dilatedHashes);
-  for (const version of [0, 1, 5, 255]) {
+  assert.equal(rowsBytes[4], 5);
+  for (const version of [0, 1, 6, 255]) {
     assert.throws(() => decode(fileOf(paper, version)), { name: "UnsupportedVersion" });
   }
 });

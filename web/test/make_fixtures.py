@@ -60,9 +60,11 @@ NEIGHBOURS = (
     GroupShape(Role.LOG_SCALES, 6, STEPS, (0, 2), sees_neighbours=True),
     GroupShape(Role.RESIDUAL, 2, (1.0,), (1, 3)),
 )
+WITH_ROWS: dict[str, Any] = {"angular_dilation": 2.0**-18, "row_context": True}
 MUTANTS = 150
 STARTS = (b"", b"\x93", b"\x93CG", b"CGS", b"\x93CGS", b"\x93CGS\2\0", b"\x93CGS\1\0\5", b"PK\3\4")
-EVERY_LEVEL = [-1]  # in place of levels: a range for each that has anchors of its own
+# In place of levels: a range for each that has anchors of its own, and one for all of them.
+EVERY_LEVEL, ONE_RANGE = [-1], [-2]
 
 
 def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
@@ -88,6 +90,15 @@ def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
     for group in wild.groups:
         group.symbols[::7] *= 900  # beyond what a network takes
     made["deep_neighbours"] = (replace(wild, coordinates=wild.coordinates * 7001), None)
+    many = make_dimensions(4, MANY_GROUPS, "separate", 24)
+    made["rows"] = (make_content(400, 16, many, kept=0.6, **WITH_ROWS), EVERY_LEVEL)
+    unlike = make_content(500, 17, near, kept=0.5, **WITH_ROWS)
+    for group in unlike.groups:
+        group.symbols[::7] *= 900  # escapes amid rows, whose values need the tables that were used
+    made["unlike_rows"] = (unlike, EVERY_LEVEL)
+    # Its references are more than a chunk, whose end is amid a row.
+    long = make_content(30_000, 18, make_dimensions(2, paper_groups(37, 0)), **WITH_ROWS)
+    made["chunks_of_rows"] = (long, ONE_RANGE)
     escapes = make_content(200, 9, make_dimensions(3, paper_groups(4, 2)))
     for group in escapes.groups:
         existing = group.symbols if group.shape.role != Role.RESIDUAL else group.symbols[escapes.mask]
@@ -245,9 +256,10 @@ def _case(data: bytes, *, prefix: bool) -> dict[str, Any]:
 
 
 def _written(content: FileContent, levels: list[int] | None) -> bytes:
-    if levels is EVERY_LEVEL:
+    if levels in (EVERY_LEVEL, ONE_RANGE):
         counts = level_counts(content.coordinates[canonical_order(content.coordinates)])
-        levels = [level for level, count in enumerate(counts) if level == 0 or count > counts[level - 1]]
+        every = [level for level, count in enumerate(counts) if level == 0 or count > counts[level - 1]]
+        levels = every if levels == EVERY_LEVEL else every[-1:]
     return write_content(content, levels=levels)
 
 

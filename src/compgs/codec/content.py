@@ -1,7 +1,8 @@
 """What a file holds, as integers: between the trained model (floats, torch) and the bytes.
 
-"Q12" is fixed point with 12 fractional bits. A latent is in units of its quantization step; a symbol is the
-whole number of steps between a latent and the mean that is predicted for it. Rows are anchors.
+"Q12" is fixed point with 12 fractional bits. A latent is in units of its quantization step; it lies whole *steps* from
+the mean that is predicted for it. A symbol is such a number of steps, or what earlier ones of its row leave of it
+(`rows.py`). Rows of arrays are anchors.
 
 Latents come in *groups*, a causal chain: the symbols of a group are coded either by tables, one a channel, or around
 means and scales that a network predicts from groups before it. The paper's entropy model (CompGS Sec. 3.3, Fig. 4) is
@@ -33,9 +34,12 @@ from compgs.codec.integer_network import (
 )
 from compgs.codec.neighbour_context import neighbour_context
 from compgs.codec.rans import escape_bits
+from compgs.codec.rows import Rows, steps_of_rows, symbols_of_rows
 from compgs.codec.tables import FrequencyTables, HyperTable, channel_tables, gaussian_tables
 from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
+from compgs.model.constants import SHARED_RESIDUALS
+from compgs.model.head_weights import HeadDimensions, weight_shapes
 from compgs.numerics.compiled import njit, portion
 from compgs.ordering.neighbours import BESIDES, Neighbours, find_neighbours
 from compgs.ordering.order import level_counts, octree_depth, octree_origin
@@ -119,6 +123,20 @@ class Dimensions:
         return [g.sees_neighbours for g in self.groups if g.has_network]
 
     @property
+    def channels_of_networks(self) -> list[int]:
+        """Channels of their groups."""
+        return [g.channels for g in self.groups if g.has_network]
+
+    @property
+    def head_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of the prediction networks' parameters, by name, in the order of files that leave the names out."""
+        sizes = HeadDimensions(self.reference_dim, self.residual_dim, self.width)
+        shapes = weight_shapes(self.heads, sizes)
+        if self.channels(Role.RESIDUAL) == 0:
+            shapes[SHARED_RESIDUALS] = (self.coupled_primitives, self.residual_dim)
+        return shapes
+
+    @property
     def table_count(self) -> int:
         """Tables in the file: one for each channel of the groups without network."""
         return sum(g.width(self.coupled_primitives) for g in self.groups if not g.has_network)
@@ -189,9 +207,9 @@ def fixed_point(symbols: np.ndarray) -> np.ndarray:  # int32, Q12
     return symbols << FRACTION_BITS
 
 
-def reconstruct(symbols: np.ndarray, means: np.ndarray) -> np.ndarray:  # int32, Q12
-    """Latents from symbols and means (same shape, Q12); they take the means' place."""
-    _add_steps(symbols.reshape(-1), means.reshape(-1))
+def reconstruct(steps: np.ndarray, means: np.ndarray) -> np.ndarray:  # int32, Q12
+    """Latents from steps and means (same shape, Q12); they take the means' place."""
+    _add_steps(steps.reshape(-1), means.reshape(-1))
     return means
 
 
@@ -296,14 +314,14 @@ def scatter_existing(existing: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [
     return slots
 
 
-def _additions_worth_sharing(symbols: np.ndarray, means: np.ndarray) -> int:
-    return symbols.size >> 17  # 30 microseconds
+def _additions_worth_sharing(steps: np.ndarray, means: np.ndarray) -> int:
+    return steps.size >> 17  # 30 microseconds
 
 
 @njit(parallel=True, worth=_additions_worth_sharing)
-def _add_steps(symbols, means, share):
-    for i in portion(len(symbols), share):
-        means[i] += symbols[i] << FRACTION_BITS
+def _add_steps(steps, means, share):
+    for i in portion(len(steps), share):
+        means[i] += steps[i] << FRACTION_BITS
 
 
 @njit(parallel=True)
@@ -328,13 +346,29 @@ class CodedGroup:
     """A group's symbols as a stream has them, with what both sides of the coder know; rows as in `Latents`."""
 
     symbols: np.ndarray
-    table_index: np.ndarray  # of each symbol
+    table_index: np.ndarray  # of each symbol, before its row says anything
     tables: FrequencyTables
     latents: np.ndarray
+    inertia: int = 0  # of its rows
+
+    @property
+    def rows(self) -> Rows:
+        """Of its stream."""
+        return Rows(self.symbols.shape[1], self.inertia)
+
+    def part(self, rows: slice) -> "CodedGroup":
+        """Some of its rows."""
+        return replace(
+            self, symbols=self.symbols[rows], table_index=self.table_index[rows], latents=self.latents[rows]
+        )
+
+    def bits(self) -> float:
+        """Code length, escapes included, were it one stream."""
+        return float(sum(escape_bits(self.symbols.ravel(), self.table_index.ravel(), self.tables, self.rows)))
 
 
-# Symbols of anchors of a group, given their means (None: it has tables) and the index of each symbol's table.
-SymbolsOf = Callable[[slice, np.ndarray | None, np.ndarray], np.ndarray]
+# Steps of anchors of a group, given their means (None: it has tables) and the index of each symbol's table.
+StepsOf = Callable[[slice, np.ndarray | None, np.ndarray], np.ndarray]
 
 
 def code_group(
@@ -343,17 +377,20 @@ def code_group(
     before: Sequence[np.ndarray],  # latents of the groups before
     known: Surroundings,
     mask: np.ndarray,  # [N, K]
-    symbols_of: SymbolsOf,
+    steps_of: StepsOf,
 ) -> CodedGroup:
     """A group of all anchors: at once, or range by range where it sees neighbours."""
     if not shape.sees_neighbours:
         means, index, tables = conditional_tables(shape, prior, before, known.places, mask)
-        symbols = symbols_of(slice(0, len(mask)), means, index)
-        latents = fixed_point(symbols) if means is None else reconstruct(symbols, means)
-        return CodedGroup(symbols, index, tables, latents)
+        steps = steps_of(slice(0, len(mask)), means, index)
+        if means is None:
+            return CodedGroup(steps, index, tables, fixed_point(steps))
+        assert isinstance(prior, IntegerNetwork)
+        symbols = symbols_of_rows(prior.rows, steps)
+        return CodedGroup(symbols, index, tables, reconstruct(steps, means), prior.rows.inertia)
     assert isinstance(prior, IntegerNetwork)
-    symbols, latents = np.empty((2, len(mask), shape.channels), np.int32)
-    index, tables = np.empty(symbols.shape, np.uint8), gaussian_tables()
+    steps, latents = np.empty((2, len(mask), shape.channels), np.int32)
+    index, tables = np.empty(steps.shape, np.uint8), gaussian_tables()
     for number in range(len(known.ends)):
         rows = known.rows(number)
         said = known.around(number, prior, latents[: rows.start])
@@ -362,23 +399,25 @@ def code_group(
             shape, prior, context, known.places[rows], mask[rows], said
         )
         assert means is not None
-        symbols[rows] = symbols_of(rows, means, index[rows])
-        latents[rows] = reconstruct(symbols[rows], means)
-    return CodedGroup(symbols, index, tables, latents)
+        steps[rows] = steps_of(rows, means, index[rows])
+        latents[rows] = reconstruct(steps[rows], means)
+    return CodedGroup(symbols_of_rows(prior.rows, steps), index, tables, latents, prior.rows.inertia)
 
 
 def walk(groups: Sequence[Group], mask: np.ndarray, known: Surroundings) -> Iterator[CodedGroup]:
     """Along the chain of groups, each given the ones before. mask: [N, K]."""
     latents: list[np.ndarray] = []
     for group in groups:
-        coded = code_group(group.shape, group.prior, latents, known, mask, _symbols_of(group, mask))
+        coded = code_group(group.shape, group.prior, latents, known, mask, steps_of(group, mask))
         latents.append(coded.latents)
         yield coded
 
 
-def _symbols_of(group: Group, mask: np.ndarray) -> SymbolsOf:
+def steps_of(group: Group, mask: np.ndarray) -> StepsOf:
+    """Those that a group has."""
     symbols = existing_symbols(group, mask)
-    return lambda rows, *_: symbols if group.shape.role == Role.RESIDUAL else symbols[rows]
+    steps = steps_of_rows(group.prior.rows, symbols) if isinstance(group.prior, IntegerNetwork) else symbols
+    return lambda rows, *_: steps if group.shape.role == Role.RESIDUAL else steps[rows]
 
 
 def dequantize(content: FileContent) -> Latents:
@@ -390,7 +429,4 @@ def dequantize(content: FileContent) -> Latents:
 def cross_entropy_bits(content: FileContent) -> list[float]:
     """Code length of each group under the file's own integer tables, escapes included: what a perfect coder needs."""
     known = surroundings(content.coordinates, content.levels)
-    return [
-        float(sum(escape_bits(coded.symbols.ravel(), coded.table_index.ravel(), coded.tables)))
-        for coded in walk(content.groups, content.mask, known)
-    ]
+    return [coded.bits() for coded in walk(content.groups, content.mask, known)]

@@ -17,7 +17,7 @@ from compgs.devices import placed
 from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile
 from compgs.model.arrays import PrimitiveArrays
 from compgs.model.constants import SHARED_RESIDUALS
-from compgs.model.head_weights import HeadDimensions, HeadWeights, weight_shapes
+from compgs.model.head_weights import HeadDimensions, HeadWeights
 from compgs.model.hybrid_model import HybridModel
 
 if TYPE_CHECKING:
@@ -63,9 +63,7 @@ def from_latents(content: FileContent, latents: Latents) -> HybridModel:
     """Integers to floats: one rounding a value, the same on every machine."""
     d = content.dimensions
     dimensions = HeadDimensions(d.reference_dim, d.residual_dim, d.width)
-    stored, shapes = dict(content.heads), weight_shapes(d.heads, dimensions)
-    if d.channels(Role.RESIDUAL) == 0:
-        shapes[SHARED_RESIDUALS] = (d.coupled_primitives, d.residual_dim)
+    stored, shapes = dict(content.heads), d.head_shapes
     if stored.keys() != shapes.keys():
         raise CorruptSection(f"prediction heads: expected {sorted(shapes)}, found {sorted(stored)}")
     values = {}

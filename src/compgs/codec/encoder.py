@@ -27,8 +27,9 @@ from compgs.codec.content import (
     surroundings,
 )
 from compgs.codec.integer_network import FRACTION_BITS, Follow, IntegerLayer, IntegerNetwork
+from compgs.codec.row_fitting import fitted
 from compgs.codec.tables import HyperTable, hyper_tables
-from compgs.codec.viewpoint_cameras import viewpoints_from_cameras
+from compgs.codec.viewpoint_cameras import kept_viewpoints, viewpoints_from_cameras
 from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 from compgs.codec.writer import Geometry, write_content
@@ -105,7 +106,9 @@ def _coded_model(model: TrainedModel, viewpoints: int | None) -> tuple[FileConte
     kept = kept[torch.from_numpy(canonical_order(model.coordinates.cpu()[kept].numpy()))]
     coordinates, mask = model.coordinates.cpu()[kept].numpy(), model.mask.cpu()[kept].numpy()
     d = model.dimensions
-    chain = _Chain(mask, surroundings(coordinates), model.weights.network)
+    # Files of scenes without one are of versions that have no room for it.
+    row_context = model.config.model.row_context and model.angular_dilation is not None
+    chain = _Chain(mask, surroundings(coordinates), model.weights.network, row_context)
     for code in (_code_references, _code_log_scales, _code_residuals):
         code(chain, model, kept)
     content = FileContent(
@@ -125,25 +128,27 @@ def _coded_model(model: TrainedModel, viewpoints: int | None) -> tuple[FileConte
             (name, quantized_tensor(tensor, model.weights.bits(name, tensor)))
             for name, tensor in model.head_tensors().items()
         ),
-        viewpoints=_viewpoints(model, viewpoints),
+        viewpoints=_viewpoints(model, viewpoints, len(kept)),
         levels=chain.known.levels,
         metadata={"creator": f"compgs {__version__}"},
     )
     return content, chain.coded
 
 
-def _viewpoints(model: TrainedModel, count: int | None) -> Viewpoints | None:
-    cameras = model.viewpoints[: model.config.training.viewpoints if count is None else count]
+def _viewpoints(model: TrainedModel, count: int | None, anchors: int) -> Viewpoints | None:
+    count = kept_viewpoints(model.config.training.viewpoints, anchors) if count is None else count
+    cameras = model.viewpoints[:count]
     return viewpoints_from_cameras(cameras, model.up, model.world_offset) if cameras else None
 
 
 class _Chain:
     """The groups of a file one after the other, each coded given the ones before."""
 
-    def __init__(self, mask: np.ndarray, known: Surroundings, network_bits: int) -> None:
+    def __init__(self, mask: np.ndarray, known: Surroundings, network_bits: int, row_context: bool) -> None:
         self.mask = mask  # [N, K] bool
         self.known = known
         self.network_bits = network_bits
+        self.row_context = row_context  # whether symbols say something about later ones of their row
         self.groups: list[Group] = []
         self.coded: list[CodedGroup] = []
 
@@ -165,12 +170,19 @@ class _Chain:
         """`y` [N, channels] float64; with RESIDUAL [P, channels], of the coupled primitives that exist."""
         before = [group.latents for group in self.coded]
 
-        def symbols_of(rows: slice, means: np.ndarray | None, _: np.ndarray) -> np.ndarray:
+        def steps_of(rows: slice, means: np.ndarray | None, _: np.ndarray) -> np.ndarray:
             wanted = y if shape.role == Role.RESIDUAL else y[rows]
             return np.rint(wanted if means is None else wanted - means / ONE).astype(np.int32)
 
-        self.coded.append(code_group(shape, prior, before, self.known, self.mask, symbols_of))
-        symbols = self.coded[-1].symbols
+        def code(prior: IntegerNetwork | tuple[HyperTable, ...]) -> CodedGroup:
+            return code_group(shape, prior, before, self.known, self.mask, steps_of)
+
+        if self.row_context and isinstance(prior, IntegerNetwork):
+            prior, coded = fitted(shape.role, prior, code)
+        else:
+            coded = code(prior)
+        self.coded.append(coded)
+        symbols = coded.symbols
         slots = scatter_existing(symbols, self.mask) if shape.role == Role.RESIDUAL else symbols
         self.groups.append(Group(shape, prior, slots))
         return len(self.groups) - 1

@@ -13,10 +13,12 @@ from dataclasses import dataclass
 from compgs.errors import CorruptSection, NotACompGSFile, NotEncodable, TruncatedSection, UnsupportedVersion
 
 MAGIC = b"\x93CGS"  # not text, and not valid UTF-8
-VERSION = 4
+VERSION = 5
 OLDEST_VERSION = 2  # that is read
 FIRST_WITH_NEIGHBOURS = 3  # version from which on groups may take what neighbours have
 FIRST_WITH_DILATION = 4  # version from which on the scene section has an angular dilation
+# Version from which on symbols may say something about later ones of their row, and heads have no names.
+FIRST_WITH_ROWS = 5
 OPTIONAL = 0x80  # sections with this bit in their number may be skipped by a decoder that does not know them
 MAX_SECTIONS = 64
 MAX_FILE_BYTES = (1 << 32) - 1

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from compgs.codec.rows import NOTHING, RowContext
 from compgs.numerics.compiled import njit, portion
 
 FRACTION_BITS = 12
@@ -65,6 +66,7 @@ class IntegerNetwork:
         False  # the last of several layers takes the network's inputs behind the activations before it
     )
     follow: Follow | None = None  # of a group that sees neighbours
+    rows: RowContext = NOTHING
 
     def __post_init__(self) -> None:
         if not self.layers:

@@ -21,6 +21,7 @@ from compgs.codec.fields import FieldReader, varint
 from compgs.codec.format import LATENTS, MAX_ANCHORS, MAX_COUPLED_PRIMITIVES, MAX_SYMBOL, SECTION_NAMES
 from compgs.codec.integer_network import IntegerNetwork
 from compgs.codec.rans import encode_symbols, read_symbols, skip_symbols
+from compgs.codec.rows import NOTHING, Rows, steps_of_rows
 from compgs.codec.tables import HyperTable
 from compgs.errors import CorruptSection
 from compgs.ordering.order import MAXIMUM_DEPTH
@@ -45,7 +46,8 @@ def encode_range(
     """The section of n anchors."""
     parts = [bytes([level]), varint(len(mask)), varint(int(mask.sum()))]
     parts += [
-        encode_symbols(coded.symbols.ravel(), coded.table_index.ravel(), coded.tables) for coded in chain
+        encode_symbols(coded.symbols.ravel(), coded.table_index.ravel(), coded.tables, coded.rows)
+        for coded in chain
     ]
     return b"".join(parts)
 
@@ -70,13 +72,22 @@ def decode_range(
     for i, (shape, prior) in enumerate(zip(dimensions.groups, priors, strict=True)):
         said = around(i, prior) if shape.sees_neighbours and isinstance(prior, IntegerNetwork) else None
         means, index, tables = conditional_tables(shape, prior, latents, places, mask, said)
-        symbols = read_symbols(reader, index.ravel(), tables).reshape(index.shape)
-        if symbols.size and (symbols.min() < -MAX_SYMBOL or symbols.max() > MAX_SYMBOL):
-            raise CorruptSection(f"{reader.section}: a symbol is not in -{MAX_SYMBOL} to {MAX_SYMBOL}")
-        latents.append(fixed_point(symbols) if means is None else reconstruct(symbols, means))
+        context = prior.rows if isinstance(prior, IntegerNetwork) else NOTHING
+        rows = Rows(shape.channels, context.inertia)
+        symbols = read_symbols(reader, index.ravel(), tables, rows).reshape(index.shape)
+        _check_size(reader.section, "a symbol", symbols)
+        steps = steps_of_rows(context, symbols)
+        if context.chain is not None:
+            _check_size(reader.section, "a step", steps)
+        latents.append(fixed_point(steps) if means is None else reconstruct(steps, means))
         all_symbols.append(symbols)
     reader.end()
     return all_symbols, latents
+
+
+def _check_size(section: str, kind: str, values: np.ndarray) -> None:
+    if values.size and (values.min() < -MAX_SYMBOL or values.max() > MAX_SYMBOL):
+        raise CorruptSection(f"{section}: {kind} is not in -{MAX_SYMBOL} to {MAX_SYMBOL}")
 
 
 def stream_sizes(data: bytes, dimensions: Dimensions) -> tuple[RangeHead, list[int]]:

@@ -15,6 +15,16 @@ from typing import Any
 import numpy as np
 
 from compgs.codec.fields import FieldReader, varint
+from compgs.codec.rows import (
+    FAR,
+    Rows,
+    evidence,
+    followed_tables,
+    seen_after,
+    shift_after,
+    shift_edges,
+    shifted,
+)
 from compgs.codec.tables import LOOKUP_BITS, PRECISION_BITS, FrequencyTables
 from compgs.errors import CorruptSection
 from compgs.numerics.compiled import njit, portion
@@ -35,12 +45,14 @@ _LOW_WORD = np.uint64((1 << 32) - 1)
 _FULL = np.uint64(63 - PRECISION_BITS)  # a state of frequency << 47 or more would leave 63 bits when coded
 # Stands for an escaped symbol until its value is read; no table holds it.
 _ESCAPED = np.int32(-(1 << 31))
+ALONE = Rows()
 
 
 def encode_symbols(
     symbols: np.ndarray,  # [M] int32
     table_index: np.ndarray,  # [M] uint8
     tables: FrequencyTables,
+    rows: Rows = ALONE,
 ) -> bytes:
     """Bytes of a stream of symbols; nothing for no symbols."""
     count = len(symbols)
@@ -53,7 +65,7 @@ def encode_symbols(
     escapes = np.zeros(chunks, np.int64)
     layout = (tables.lowest, tables.counts, tables.offsets, tables.cumulative)
     symbols = np.ascontiguousarray(symbols, np.int32)
-    table_index = np.ascontiguousarray(table_index, np.uint8)
+    table_index = _followed(symbols, table_index, tables, rows)
     _encode_chunks(symbols, table_index, *layout, words, first, escapes)
     escape_bytes = b""
     if escapes.any():
@@ -65,17 +77,26 @@ def encode_symbols(
     return b"".join([*sizes, varint(len(escape_bytes)), *payload, escape_bytes])
 
 
+def _followed(
+    symbols: np.ndarray, table_index: np.ndarray, tables: FrequencyTables, rows: Rows
+) -> np.ndarray:
+    """The tables that symbols are coded with."""
+    index = np.ascontiguousarray(table_index, np.uint8)
+    return followed_tables(symbols, index, tables, rows, CHUNK_SYMBOLS) if rows.inertia else index
+
+
 def decode_symbols(
     data: bytes,
     table_index: np.ndarray,  # [M] uint8
     tables: FrequencyTables,
     section: str = "symbols",
+    rows: Rows = ALONE,
 ) -> np.ndarray:  # [M] int32
     """Inverse of `encode_symbols`. Raises CorruptSection, with the section's name, for bytes that it cannot
     have made.
     """
     reader = FieldReader(data, section)
-    symbols = read_symbols(reader, table_index, tables)
+    symbols = read_symbols(reader, table_index, tables, rows)
     reader.end()
     return symbols
 
@@ -104,6 +125,7 @@ def read_symbols(
     reader: FieldReader,
     table_index: np.ndarray,  # [M] uint8
     tables: FrequencyTables,
+    rows: Rows = ALONE,
 ) -> np.ndarray:  # [M] int32
     """`decode_symbols` of a stream behind which others follow."""
     count, section = len(table_index), reader.section
@@ -118,7 +140,14 @@ def read_symbols(
     escapes = np.zeros(chunks, np.int64)
     table_index = np.ascontiguousarray(table_index, np.uint8)
     layout = (tables.lowest, tables.counts, tables.offsets, tables.cumulative, tables.lookup)
-    _decode_chunks(words, ends, table_index, *layout, symbols, escapes)
+    if rows.inertia:
+        table_index = table_index.copy()  # the kernel moves them
+        constants = (evidence(), shift_edges())
+        _decode_rows(
+            words, ends, table_index, *layout, rows.width, rows.inertia, *constants, symbols, escapes
+        )
+    else:
+        _decode_chunks(words, ends, table_index, *layout, symbols, escapes)
     if (escapes < 0).any():
         raise CorruptSection(
             f"{section}: chunk {int(np.argmax(escapes < 0))} does not end as an encoder ends it"
@@ -136,10 +165,11 @@ def escape_bits(
     symbols: np.ndarray,  # [M] int32
     table_index: np.ndarray,  # [M] uint8
     tables: FrequencyTables,
+    rows: Rows = ALONE,
 ) -> tuple[float, int]:
     """Cross-entropy of the symbols under their tables, and bits of the escaped values beside it."""
     symbols = np.ascontiguousarray(symbols, np.int32)
-    table_index = np.ascontiguousarray(table_index, np.uint8)
+    table_index = _followed(symbols, table_index, tables, rows)
     bits, escapes = _code_length(
         symbols, table_index, tables.lowest, tables.counts, tables.offsets, tables.costs()
     )
@@ -276,6 +306,65 @@ def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, look
         escapes[c] = _decode_chunk(
             words, ends[c], ends[c + 1], index[start:stop], lowest, counts, offsets, cumulative, lookup,
             symbols[start:stop],
+        )  # fmt: skip
+
+
+@njit
+def _decode_rows_chunk(
+    words, begin, end, index, lowest, counts, offsets, cumulative, lookup, first, width, inertia, known, edges, symbols
+):  # fmt: skip
+    """As `_decode_chunk`, where tables follow their rows; `index` becomes what was used. `first`: channel of the first
+    symbol.
+    """
+    single = len(symbols) < SINGLE_STATE_SYMBOLS
+    position = begin + (2 if single else 4)
+    if position > end:
+        return -1
+    even = (np.uint64(words[begin + 1]) << _WORD) | np.uint64(words[begin])
+    odd = _INITIAL
+    if not single:
+        odd = (np.uint64(words[begin + 3]) << _WORD) | np.uint64(words[begin + 2])
+    if (even >> np.uint64(63)) != 0 or (odd >> np.uint64(63)) != 0 or even < _INITIAL or odd < _INITIAL:
+        return -1
+    escapes = 0
+    start = np.int64(inertia) << 12
+    seen, expected, shift, channel = start, start, np.int64(0), first
+    for i in range(len(symbols)):
+        if channel == width:
+            seen, expected, shift, channel = start, start, np.int64(0), 0
+        given = np.int64(index[i])
+        t = shifted(given, shift)
+        index[i] = np.uint8(t)
+        if single or (i & 1) == 0:
+            even, position, j = _decode_one(even, position, end, offsets[t], cumulative, lookup[t], words)
+        else:
+            odd, position, j = _decode_one(odd, position, end, offsets[t], cumulative, lookup[t], words)
+        symbol = np.int64(lowest[t]) + j
+        if j == counts[t]:
+            escapes += 1
+            symbols[i] = _ESCAPED
+            symbol = np.int64(FAR)
+        else:
+            symbols[i] = np.int32(symbol)
+        seen, expected = seen_after(seen, expected, known, given, symbol)
+        shift = shift_after(seen, expected, shift, edges)
+        channel += 1
+    if position != end or even != _INITIAL or odd != _INITIAL:
+        return -1
+    return escapes
+
+
+@njit(parallel=True, worth=_chunks)
+def _decode_rows(
+    words, ends, index, lowest, counts, offsets, cumulative, lookup, width, inertia, known, edges,
+    symbols, escapes, share,
+):  # fmt: skip
+    for c in portion(len(escapes), share):
+        start = c * CHUNK_SYMBOLS
+        stop = min(start + CHUNK_SYMBOLS, len(symbols))
+        escapes[c] = _decode_rows_chunk(
+            words, ends[c], ends[c + 1], index[start:stop], lowest, counts, offsets, cumulative, lookup,
+            start % width, width, inertia, known, edges, symbols[start:stop],
         )  # fmt: skip
 
 

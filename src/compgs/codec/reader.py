@@ -18,6 +18,7 @@ from compgs.codec.content import (
 )
 from compgs.codec.fields import FieldReader
 from compgs.codec.format import (
+    FIRST_WITH_ROWS,
     HEADS,
     LATENTS,
     MASKS,
@@ -44,7 +45,7 @@ from compgs.codec.octree import decode_positions
 from compgs.codec.sections import SceneSection, decode_metadata, decode_scene, decode_tables
 from compgs.codec.tmc3 import decode_positions_tmc3
 from compgs.codec.viewpoints import decode_viewpoints
-from compgs.codec.weights import decode_heads, decode_networks
+from compgs.codec.weights import decode_heads, decode_known_heads, decode_networks
 from compgs.errors import CorruptSection
 from compgs.numerics.crew import CREW
 from compgs.ordering.order import level_counts, represented
@@ -132,7 +133,8 @@ def read_latents(
     """
     sections = unpack(data, prefix=prefix)
     by_number = {section.number: section.data for section in sections}
-    scene = decode_scene(by_number[SCENE], SECTION_NAMES[SCENE], version_of(data))
+    version = version_of(data)
+    scene = decode_scene(by_number[SCENE], SECTION_NAMES[SCENE], version)
     d = scene.dimensions
     ranges = [section for section in sections if section.number == LATENTS]
     heads_of_ranges = [read_head(FieldReader(r.data, r.name)) for r in ranges]
@@ -155,11 +157,15 @@ def read_latents(
         d.network_sizes,
         partial(check_products, NETWORK_PRODUCTS, anchors, NETWORKS),
         d.networks_that_follow,
+        d.channels_of_networks,
+        version,
     )
     coupled = sum(head.coupled for head in heads_of_ranges) if prefix else scene.coupled
-    heads = decode_heads(
-        by_number[HEADS], SECTION_NAMES[HEADS], partial(check_products, HEAD_PRODUCTS, coupled, HEADS)
-    )
+    check_heads = partial(check_products, HEAD_PRODUCTS, coupled, HEADS)
+    if version >= FIRST_WITH_ROWS:
+        heads = decode_known_heads(by_number[HEADS], SECTION_NAMES[HEADS], d.head_shapes, check_heads)
+    else:
+        heads = decode_heads(by_number[HEADS], SECTION_NAMES[HEADS], check_heads)
     priors = _priors(d, iter(networks), iter(tables))
     read_positions = partial(_positions, by_number, scene.anchors)
     read_masks = partial(decode_masks, by_number[MASKS], scene.anchors, d.coupled_primitives)

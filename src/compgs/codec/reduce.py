@@ -17,7 +17,7 @@ from compgs.codec.content import (
     FileContent,
     Group,
     Role,
-    SymbolsOf,
+    StepsOf,
     code_group,
     conditional_tables,
     dequantize,
@@ -25,6 +25,7 @@ from compgs.codec.content import (
     surroundings,
 )
 from compgs.codec.integer_network import BIAS_LIMIT, FRACTION_BITS, IntegerNetwork
+from compgs.codec.rows import symbols_of_rows
 from compgs.codec.tables import SCALES_PER_OCTAVE
 from compgs.errors import NotEncodable
 from compgs.ordering.order import canonical_order
@@ -67,18 +68,18 @@ def _around_others(content: FileContent, latents: Sequence[np.ndarray]) -> FileC
     groups = list(content.groups)
     for i, group in enumerate(groups):
         if group.shape.sees_neighbours:
-            before, symbols_of = latents[:i], _symbols_of(latents[i])
-            coded = code_group(group.shape, group.prior, before, known, content.mask, symbols_of)
+            before, steps_of = latents[:i], _steps_of(latents[i])
+            coded = code_group(group.shape, group.prior, before, known, content.mask, steps_of)
             groups[i] = replace(group, symbols=coded.symbols)
     return replace(content, groups=tuple(groups))
 
 
-def _symbols_of(latents: np.ndarray) -> SymbolsOf:
-    def symbols_of(rows: slice, means: np.ndarray | None, _: np.ndarray) -> np.ndarray:
+def _steps_of(latents: np.ndarray) -> StepsOf:
+    def steps_of(rows: slice, means: np.ndarray | None, _: np.ndarray) -> np.ndarray:
         assert means is not None
         return (latents[rows] - means) >> FRACTION_BITS
 
-    return symbols_of
+    return steps_of
 
 
 def with_coarser_covariances(content: FileContent, ratio: float) -> FileContent:
@@ -101,9 +102,9 @@ def with_coarser_covariances(content: FileContent, ratio: float) -> FileContent:
     coded = replace(group, shape=shape, prior=network)
     places = surroundings(content.coordinates).places
     means, _, _ = conditional_tables(shape, network, latents, places, content.mask)
-    symbols = np.rint((latents[index] / ratios - means) / (1 << FRACTION_BITS)).astype(np.int32)
+    steps = np.rint((latents[index] / ratios - means) / (1 << FRACTION_BITS)).astype(np.int32)
     groups = list(content.groups)
-    groups[index] = replace(coded, symbols=symbols)
+    groups[index] = replace(coded, symbols=symbols_of_rows(network.rows, steps))
     return replace(content, groups=tuple(groups))
 
 

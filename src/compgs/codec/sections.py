@@ -13,6 +13,7 @@ from compgs.codec.fields import FieldReader, signed_varint, varint
 from compgs.codec.format import (
     FIRST_WITH_DILATION,
     FIRST_WITH_NEIGHBOURS,
+    FIRST_WITH_ROWS,
     LARGEST_DILATION,
     MAX_ANCHORS,
     MAX_COUPLED_PRIMITIVES,
@@ -82,10 +83,10 @@ def encode_scene(content: FileContent) -> bytes:
     return fields + bytes([len(d.groups)]) + b"".join(starmap(_encode_group, enumerate(d.groups)))
 
 
-def least_version(content: FileContent) -> int:
-    """Of the format, for what a file holds."""
+def version_for(content: FileContent) -> int:
+    """Of the format, for what a file holds: the newest, but for scenes of files that had no angular dilation."""
     if content.angular_dilation is not None:
-        return FIRST_WITH_DILATION
+        return FIRST_WITH_ROWS
     sees_neighbours = any(group.shape.sees_neighbours for group in content.groups)
     return FIRST_WITH_NEIGHBOURS if sees_neighbours else OLDEST_VERSION
 

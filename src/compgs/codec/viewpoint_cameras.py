@@ -10,6 +10,16 @@ from compgs.cameras import Camera
 from compgs.codec.viewpoints import MAX_LENSES, MAX_SIDE, Vector, Viewpoint, Viewpoints
 from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
 
+LEAST_VIEWPOINTS = 3
+ANCHORS_PER_VIEWPOINT = 100  # a viewpoint takes 13 bytes, an anchor some ten
+
+
+def kept_viewpoints(most: int, anchors: int) -> int:
+    """Cameras that a file of so many anchors keeps: in small ones fewer, so that they take 2 % of it at most, but for
+    the few that any viewer needs to start with.
+    """
+    return min(most, max(LEAST_VIEWPOINTS, anchors // ANCHORS_PER_VIEWPOINT))
+
 
 def viewpoints_from_cameras(
     cameras: Sequence[Camera],  # of the world, 1 to 255

@@ -6,20 +6,23 @@ counting bits.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from compgs.codec.fields import FieldReader, signed_varint, varint
+from compgs.codec.format import FIRST_WITH_ROWS, VERSION
 from compgs.codec.integer_network import MAX_SHIFT, Follow, IntegerLayer, IntegerNetwork
 from compgs.codec.rans import decode_symbols, encode_symbols
+from compgs.codec.rows import RowContext, chain_length
 from compgs.codec.tables import GAUSSIAN_COUNT, SCALES_PER_OCTAVE, SMALLEST_SCALE_OCTAVE, gaussian_tables
 from compgs.errors import CorruptSection, NotEncodable
 
 MAX_LAYERS = 8
 # A network's flag, and those of a layer beside its shift.
 SKIP = 1
+CHAINED = 2  # not before version 5
 SHIFTS, RESERVED, ADDS, RECTIFY = 0x1F, 0x20, 0x40, 0x80
 MAX_LAYER_WIDTH = 1 << 16
 MAX_TENSORS = 256
@@ -84,7 +87,7 @@ def decode_arrays(reader: FieldReader, shapes: Sequence[tuple[int, ...]]) -> lis
     return arrays
 
 
-def encode_networks(networks: Sequence[IntegerNetwork]) -> bytes:
+def encode_networks(networks: Sequence[IntegerNetwork], version: int = VERSION) -> bytes:
     """The entropy networks' section. Arrays in two halves: means and scales, in the last layer, differ in
     spread.
     """
@@ -93,7 +96,8 @@ def encode_networks(networks: Sequence[IntegerNetwork]) -> bytes:
         layers = network.layers
         if len(layers) > MAX_LAYERS:
             raise NotEncodable(f"network {n}: {len(layers)} layers, the format holds at most {MAX_LAYERS}")
-        fields.append(varint(len(layers)) + bytes([SKIP * network.skip]))
+        chain = network.rows.chain
+        fields.append(varint(len(layers)) + bytes([SKIP * network.skip | CHAINED * (chain is not None)]))
         for layer in layers:
             if max(layer.weight.shape) > MAX_LAYER_WIDTH:
                 raise NotEncodable(f"network {n}: a layer is wider than {MAX_LAYER_WIDTH}")
@@ -103,6 +107,10 @@ def encode_networks(networks: Sequence[IntegerNetwork]) -> bytes:
         if network.follow is not None:
             fields.append(bytes([network.follow.shift]))
             arrays.append(network.follow.weight)
+        if version >= FIRST_WITH_ROWS:
+            fields.append(bytes([network.rows.inertia]))
+        if chain is not None:
+            arrays.append(chain)
     _check_count("entropy networks", arrays)
     return b"".join(fields) + (encode_arrays(arrays) if arrays else b"")
 
@@ -113,23 +121,33 @@ def decode_networks(
     sizes: Sequence[tuple[int, int]],
     check_products: Callable[[int], None] = lambda products: None,
     follows: Sequence[bool] | None = None,
+    channels: Sequence[int] | None = None,
+    version: int = VERSION,
 ) -> list[IntegerNetwork]:
-    """Inverse of `encode_networks`, given (inputs, outputs) of each network, and which of their groups see neighbours
-    (None: none does). `check_products` may refuse the number of weights before any is decoded.
+    """Inverse of `encode_networks`, given (inputs, outputs) of each network, which of their groups see neighbours
+    (None: none does), and how many channels these have (None: half of the outputs). `check_products` may refuse the
+    number of weights before any is decoded.
     """
     reader = FieldReader(data, section)
     plan: list[list[int]] = []  # of each network: flags of its layers
     follows = [False] * len(sizes) if follows is None else follows
+    channels = [outputs // 2 for _, outputs in sizes] if channels is None else channels
+    chained: list[bool] = []
+    inertias: list[int] = []
     follow_shifts: list[int | None] = []
     skips = []
     shapes: list[tuple[int, ...]] = []
     for n, (inputs, outputs) in enumerate(sizes):
         widths = [inputs]
         count = reader.varint(f"layers of network {n}", 1, MAX_LAYERS)
-        skip = reader.bytes(1, f"flags of network {n}")[0]
-        if skip > SKIP or (skip and count == 1):
+        flags = reader.bytes(1, f"flags of network {n}")[0]
+        skip = flags & SKIP
+        chained.append(bool(flags & CHAINED))
+        known = SKIP | CHAINED if version >= FIRST_WITH_ROWS else SKIP
+        if flags & ~known or (skip and count == 1) or (chained[n] and channels[n] == 1):
             raise CorruptSection(
-                f"{section}: flags of network {n} are {skip}, expected 0, or with several layers 1"
+                f"{section}: flags of network {n} are {flags}: a skip needs several layers, a chain several "
+                f"channels, and of others version {version} has none"
             )
         plan.append([])
         for i in range(count):
@@ -154,13 +172,18 @@ def decode_networks(
         if follows[n]:
             follow_shifts[-1] = reader.bytes(1, f"follow shift of network {n}")[0]
             shapes.append((outputs // 2,))
+        inertias.append(0)
+        if version >= FIRST_WITH_ROWS:
+            inertias[-1] = reader.bytes(1, f"inertia of network {n}")[0]
+        if chained[n]:
+            shapes.append((chain_length(channels[n]),))
     _check_sizes(section, shapes)
     check_products(sum(shape[0] * shape[1] for shape in shapes if len(shape) == 2))
     if not sizes:
         reader.end()
         return []
     arrays = iter(decode_arrays(reader, shapes))
-    networks = []
+    networks: list[IntegerNetwork] = []
     for flags_of_layers, with_skip, follow_shift in zip(plan, skips, follow_shifts, strict=True):
         layers = []
         for flags in flags_of_layers:
@@ -171,7 +194,9 @@ def decode_networks(
             )
         try:
             follow = None if follow_shift is None else Follow(next(arrays), follow_shift)
-            networks.append(IntegerNetwork(tuple(layers), with_skip, follow))
+            chain = next(arrays) if chained[len(networks)] else None
+            rows = RowContext(chain, inertias[len(networks)])
+            networks.append(IntegerNetwork(tuple(layers), with_skip, follow, rows))
         except ValueError as error:
             raise CorruptSection(f"{section}: {error}") from error
     return networks
@@ -244,6 +269,32 @@ def decode_heads(
         (name, QuantizedTensor(array, exponent))
         for name, array, exponent in zip(names, arrays, exponents, strict=True)
     )
+
+
+def encode_known_heads(tensors: Sequence[QuantizedTensor]) -> bytes:
+    """The prediction networks' section of a file without names: tensors in the order that its scene gives."""
+    for tensor in tensors:
+        if abs(tensor.exponent) > MAX_EXPONENT:
+            raise NotEncodable(f"prediction heads: exponent {tensor.exponent}")
+    arrays = [tensor.values for tensor in tensors]
+    _check_count("prediction heads", arrays)
+    return b"".join(signed_varint(tensor.exponent) for tensor in tensors) + encode_arrays(arrays)
+
+
+def decode_known_heads(
+    data: bytes,
+    section: str,
+    shapes: Mapping[str, tuple[int, ...]],
+    check_products: Callable[[int], None] = lambda products: None,
+) -> tuple[tuple[str, QuantizedTensor], ...]:
+    """Inverse of `encode_known_heads`, given names and shapes."""
+    _check_sizes(section, list(shapes.values()))
+    check_products(sum(math.prod(shape) for shape in shapes.values()))
+    reader = FieldReader(data, section)
+    exponents = [reader.signed_varint(f"exponent of {name}", -MAX_EXPONENT, MAX_EXPONENT) for name in shapes]
+    arrays = decode_arrays(reader, list(shapes.values()))
+    tensors = map(QuantizedTensor, arrays, exponents)
+    return tuple(zip(shapes, tensors, strict=True))
 
 
 def _split(values: np.ndarray, low_bits: int) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from compgs.codec.content import (
 )
 from compgs.codec.fields import FieldReader
 from compgs.codec.format import (
+    FIRST_WITH_ROWS,
     HEADS,
     LATENTS,
     MASKS,
@@ -41,6 +42,7 @@ from compgs.codec.latents import encode_range, read_head
 from compgs.codec.limits import least_bytes
 from compgs.codec.mask_coder import encode_masks
 from compgs.codec.octree import encode_positions
+from compgs.codec.rows import RowContext, chain_length, steps_of_rows
 from compgs.codec.sections import (
     HEADS as HEAD_LAYOUTS,
 )
@@ -48,14 +50,14 @@ from compgs.codec.sections import (
     encode_metadata,
     encode_scene,
     encode_tables,
-    least_version,
+    version_for,
     wrong_dimension,
     wrong_number,
 )
 from compgs.codec.tables import LEVELS, MAX_HYPER_SYMBOLS, MAX_LOWEST
 from compgs.codec.tmc3 import encode_positions_tmc3
 from compgs.codec.viewpoints import encode_viewpoints
-from compgs.codec.weights import encode_heads, encode_networks
+from compgs.codec.weights import encode_heads, encode_known_heads, encode_networks
 from compgs.errors import NotEncodable
 from compgs.ordering.order import canonical_order
 
@@ -86,6 +88,7 @@ def write_content(
     known = surroundings(content.coordinates, content.levels if levels is None else levels)
     networks = [g.prior for g in content.groups if isinstance(g.prior, IntegerNetwork)]
     tables = [table for g in content.groups if not isinstance(g.prior, IntegerNetwork) for table in g.prior]
+    version = version_for(content)
     sections = [Section(SCENE, encode_scene(content))]
     if content.viewpoints is not None:
         sections.append(Section(VIEWPOINTS, encode_viewpoints(content.viewpoints)))
@@ -93,8 +96,8 @@ def write_content(
         _positions(content.coordinates, geometry),
         Section(MASKS, encode_masks(content.mask)),
         Section(TABLES, encode_tables(tables)),
-        Section(NETWORKS, encode_networks(networks)),
-        Section(HEADS, encode_heads(content.heads)),
+        Section(NETWORKS, encode_networks(networks, version)),
+        Section(HEADS, _heads(content, version)),
     ]
     ranges = _ranges(content, known, coded)
     padding = _padding(content, sections, ranges)
@@ -102,7 +105,15 @@ def write_content(
         sections.append(Section(PADDING, bytes(padding)))
     if content.metadata:
         ranges.append(Section(METADATA, encode_metadata(content.metadata)))
-    return pack(sections + ranges, least_version(content))
+    return pack(sections + ranges, version)
+
+
+def _heads(content: FileContent, version: int) -> bytes:
+    """By name, or in the order of their names where files have none."""
+    if version < FIRST_WITH_ROWS:
+        return encode_heads(content.heads)
+    stored = dict(content.heads)
+    return encode_known_heads([stored[name] for name in content.dimensions.head_shapes])
 
 
 def _positions(coordinates: np.ndarray, geometry: Geometry) -> Section:
@@ -129,7 +140,7 @@ def _of_rows(content: FileContent, coded: Sequence[CodedGroup], rows: slice) -> 
     existing = slice(int(first[rows.start]), int(first[rows.stop]))
     for group, whole in zip(content.groups, coded, strict=True):
         part = existing if group.shape.role == Role.RESIDUAL else rows
-        yield CodedGroup(whole.symbols[part], whole.table_index[part], whole.tables, whole.latents[part])
+        yield whole.part(part)
 
 
 def check_content(content: FileContent) -> None:
@@ -147,9 +158,20 @@ def check_content(content: FileContent) -> None:
     _check_array("mask", content.mask, (anchors, d.coupled_primitives), np.bool_)
     for i, group in enumerate(content.groups):
         _check_group(i, group, content)
+    if version_for(content) >= FIRST_WITH_ROWS:
+        _check_heads(content)
     size = len(encode_metadata(content.metadata))
     if size > MAX_METADATA_BYTES:
         raise NotEncodable(f"metadata takes {size} bytes, the format holds at most {MAX_METADATA_BYTES}")
+
+
+def _check_heads(content: FileContent) -> None:
+    """Files without names hold exactly the tensors that their scene asks for."""
+    found = {name: tensor.values.shape for name, tensor in content.heads}
+    expected = content.dimensions.head_shapes
+    if found != expected or len(found) < len(content.heads):
+        wrong = sorted(name for name in found.keys() | expected if found.get(name) != expected.get(name))
+        raise NotEncodable(f"prediction heads: expected {expected}, found others at {wrong}")
 
 
 def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...], dtype: type) -> None:
@@ -175,6 +197,7 @@ def _check_group(index: int, group: Group, content: FileContent) -> None:
             raise NotEncodable(
                 f"{name}: expected a network that follows neighbours where the group sees them"
             )
+        _check_rows(name, group.prior.rows, symbols, version_for(content))
         found = group.prior.inputs, group.prior.outputs
         if found != d.network_size(shape):
             raise NotEncodable(
@@ -192,6 +215,27 @@ def _check_group(index: int, group: Group, content: FileContent) -> None:
             )
         if table.levels.min() < 0 or table.levels.max() >= LEVELS:
             raise NotEncodable(f"{name}: table {i} has a level outside 0 to {LEVELS - 1}")
+
+
+def _check_rows(name: str, rows: RowContext, symbols: np.ndarray, version: int) -> None:
+    channels = symbols.shape[-1]
+    if rows.chain is None and rows.inertia == 0:
+        return
+    if version < FIRST_WITH_ROWS:
+        raise NotEncodable(
+            f"{name}: a chain or inertia, which scenes without an angular dilation cannot have"
+        )
+    if rows.chain is not None and (channels == 1 or rows.chain.shape != (chain_length(channels),)):
+        raise NotEncodable(
+            f"{name}: a chain of {rows.chain.shape} elements for {channels} channels, "
+            f"expected {chain_length(channels)}, and several channels"
+        )
+    steps = steps_of_rows(rows, symbols.reshape(-1, channels))
+    if steps.min() < -MAX_SYMBOL or steps.max() > MAX_SYMBOL:
+        raise NotEncodable(
+            f"{name}: with its chain steps from {steps.min()} to {steps.max()}, the format holds -{MAX_SYMBOL} to "
+            f"{MAX_SYMBOL}; use a larger quantization step"
+        )
 
 
 def _padding(content: FileContent, before: list[Section], ranges: list[Section]) -> int:

@@ -13,6 +13,7 @@ from compgs.codec.content import FileContent
 from compgs.codec.decoder import from_latents
 from compgs.codec.reader import read_latents
 from compgs.codec.reduce import with_coarser_covariances, without_coupled
+from compgs.codec.row_fitting import with_fitted_rows
 from compgs.codec.writer import Geometry, write_content
 from compgs.devices import placed
 from compgs.errors import ConfigError
@@ -81,6 +82,8 @@ def reduce_file(
         smaller = without_coupled(smaller, most_important(model, cameras, drop, progress))
     if coarser > 1:
         smaller = with_coarser_covariances(smaller, coarser)
+    if smaller.angular_dilation is not None:
+        smaller = with_fitted_rows(smaller)
     smaller = replace(smaller, metadata={**content.metadata, "reduced": described(content, drop, coarser)})
     result = write_content(smaller, geometry)
     if len(result) >= len(data):

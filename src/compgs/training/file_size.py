@@ -6,15 +6,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from compgs.codec.encoder import encoded
 from compgs.codec.mask_coder import encode_masks
 from compgs.codec.octree import encode_positions
+from compgs.codec.viewpoint_cameras import kept_viewpoints
 from compgs.entropy.network import FRACTION_BITS
 from compgs.entropy.quantization import weight_exponent
 from compgs.ordering.order import canonical_order
 from compgs.trained_model import TrainedModel
 
 POSITION_BITS = 10.0  # that one anchor less saves of the positions, about
-OTHER_BYTES = 600  # names of tensors, scene, tables, metadata, container, about
+OTHER_BYTES = 350  # scene, tables, metadata, container, about
 LENS_BYTES, VIEWPOINT_BYTES = 32, 13  # of the cameras that the file keeps
 
 
@@ -32,6 +34,12 @@ class FileSize:
         """
         mask = self.model.mask if mask is None else mask
         return sum(self.model.estimated_bits(mask).values()) / 8 + self._geometry(mask)
+
+    def written_share(self) -> float:
+        """Of these bytes, what a file takes as it would be written now: its rows say more of themselves than training
+        pays for (`codec/rows.py`).
+        """
+        return max(1.0, len(encoded(self.model)[0]) - fixed_bytes(self.model)) / max(1.0, self.latents())
 
     def _geometry(self, mask: Tensor) -> int:
         """Bytes of positions and masks."""
@@ -76,7 +84,8 @@ def fixed_bytes(model: TrainedModel) -> int:
             # In halves, as the file has them: means and scales differ in spread.
             bits += sum(gaussian_entropy(half) for half in scaled.tensor_split(2))
             bits += sum(gaussian_entropy(half * 2.0**FRACTION_BITS) for half in bias.tensor_split(2))
-    kept = min(len(model.viewpoints), model.config.training.viewpoints)
+    kept = kept_viewpoints(model.config.training.viewpoints, len(model.coordinates))
+    kept = min(len(model.viewpoints), kept)
     return int(bits / 8) + OTHER_BYTES + (LENS_BYTES + VIEWPOINT_BYTES * kept if kept else 0)
 
 

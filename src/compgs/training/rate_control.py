@@ -36,6 +36,7 @@ class RateState:
     error: float | None = None  # log(size / target) at the last estimate after growth; None before the first
     share: float = 1.0  # of the present bytes that later pruning will leave
     slow: float | None = None  # lambda as pruning sees it; None: as it is
+    written: float = 1.0  # of the bytes that training pays for, what a file takes
 
     @property
     def lmbda_of_pruning(self) -> float:
@@ -45,7 +46,7 @@ class RateState:
     def restored(values: dict[str, Any]) -> "RateState":
         """Of a checkpoint. Raises ValueError, TypeError for what is no state."""
         state = RateState(**values)
-        numbers = (state.lmbda, state.error or 0.0, state.share, state.slow or 0.0)
+        numbers = (state.lmbda, state.error or 0.0, state.share, state.slow or 0.0, state.written)
         if not all(math.isfinite(number) for number in numbers):
             raise ValueError(f"the state of lambda is not finite: {values}")
         return state

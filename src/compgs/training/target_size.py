@@ -62,19 +62,21 @@ class TargetSize:
             raise TrainingError(f"step {step}: the rate is {size}; try a lower learning rate or another seed")
         pruned = any(step - t.steps // LOOKS <= at < step for at in self.pruned_at)
         if pruned or step % max(1, t.steps // SHARES) == 0 or (grown and state.error is None):
-            state = replace(state, share=self.lasting_share(state.lmbda_of_pruning, step))
+            share = self.lasting_share(state.lmbda_of_pruning, step)
+            state = replace(state, share=share, written=self.file.written_share())
         target = max(1, t.target_bytes - fixed)
-        return follow(state, size * state.share, target, progress=step / t.steps, grown=grown)
+        return follow(state, size * state.written * state.share, target, progress=step / t.steps, grown=grown)
 
-    def bits_that_stay(self, step: int, bits: Tensor) -> tuple[float, float]:
+    def bits_that_stay(self, step: int, bits: Tensor, written: float) -> tuple[float, float]:
         """Of all `bits` [N] of the anchors, after a pruning at this step: with fewer than the first no lambda would
         bring the file to its size, and with more than the second after the last pruning none would in time.
+        `written`: of the bytes that training pays for, what a file takes.
         """
         target = self.config.training.target_bytes
         if target is None:
             return 0.0, math.inf
         drawn = missed(self.contributions(), self.config.control.idle_share)
-        share = (target - fixed_bytes(self.model)) / max(1.0, self.size(drawn))
+        share = (target - fixed_bytes(self.model)) / max(1.0, written * self.size(drawn))
         wanted = share * float(bits.sum(dtype=torch.float64))
         return wanted, SETTLES * wanted if step == max(self.pruned_at) else math.inf
 

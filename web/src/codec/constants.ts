@@ -1,10 +1,11 @@
 /** The constants of docs/bitstream.md, under the same names. */
 
 export const MAGIC = [0x93, 0x43, 0x47, 0x53] as const;
-export const VERSION = 4;
+export const VERSION = 5;
 export const OLDEST_VERSION = 2;
 export const FIRST_WITH_NEIGHBOURS = 3;
 export const FIRST_WITH_DILATION = 4;
+export const FIRST_WITH_ROWS = 5;
 export const OPTIONAL = 0x80;
 export const MAX_SECTIONS = 64;
 export const MAX_ANCHORS = 1 << 24;
@@ -54,6 +55,12 @@ export const MAX_WEIGHTS = 1 << 22;
 export const MAX_LOW_BITS = 26;
 export const FOLLOW_LIMIT = 2 ** 28;
 export const NEAREST_WEIGHT = 2 ** 24;
+export const CHAIN_BITS = 6;
+export const CHAIN_LIMIT = 1 << 12;
+export const MAX_INERTIA = 63;
+export const SIZE_OFFSET = 1229;
+export const SIZE_CAP = 4;
+export const LARGEST_TABLE_SHIFT = 36;
 /** Levels of the octree; a coordinate's offset has so many bits. */
 export const MAX_DEPTH = 21;
 /** Log scales of an anchor: three of its reach, three of its size. */

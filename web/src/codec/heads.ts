@@ -1,6 +1,7 @@
-/** The prediction heads section: named tensors (docs/bitstream.md, "Prediction heads"). */
+/** The prediction heads section: tensors, until version 4 with their names (docs/bitstream.md, "Prediction heads"). */
 
 import {
+  FIRST_WITH_ROWS,
   MAX_EXPONENT,
   MAX_LAYER_WIDTH,
   MAX_NAME_BYTES,
@@ -9,8 +10,10 @@ import {
   MAX_WEIGHTS,
 } from "./constants.ts";
 import { FieldReader } from "./fields.ts";
+import { type TensorShape, headTensors } from "./head_tensors.ts";
 import { readArrays } from "./integer_arrays.ts";
 import type { Kernels } from "./kernels.ts";
+import type { SceneSection } from "./scene_section.ts";
 
 export interface Tensor {
   shape: number[];
@@ -19,36 +22,64 @@ export interface Tensor {
   values: Int32Array;
 }
 
-export function readHeads(payload: Uint8Array, name: string, kernels: Kernels): Map<string, Tensor> {
+interface TensorHead extends TensorShape {
+  exponent: number;
+}
+
+/** Tensors by name, in the order of the file. */
+export function readHeads(
+  payload: Uint8Array,
+  scene: SceneSection,
+  name: string,
+  version: number,
+  kernels: Kernels,
+): Map<string, Tensor> {
   const reader = new FieldReader(payload, name);
-  const count = reader.varint("tensors", 0, MAX_TENSORS);
-  const heads: Array<{ name: string; shape: number[]; exponent: number; size: number }> = [];
-  let previous: Uint8Array = new Uint8Array(0);
-  let elements = 0;
-  for (let i = 0; i < count; i++) {
-    previous = readName(reader, previous);
-    const tensorName = decodeText(previous, reader);
-    if (heads.some((head) => head.name === tensorName)) reader.refuse(`tensor ${tensorName} is there twice`);
-    const rank = reader.varint("rank", 0, MAX_RANK);
-    const shape: number[] = [];
-    for (let side = 0; side < rank; side++) shape.push(reader.varint("side", 0, MAX_LAYER_WIDTH));
-    const exponent = reader.signedVarint("exponent", -MAX_EXPONENT, MAX_EXPONENT);
-    const size = shape.reduce((a, b) => a * b, 1);
-    elements += size;
-    if (elements > MAX_WEIGHTS) reader.refuse(`more than ${MAX_WEIGHTS} elements of tensors`);
-    heads.push({ name: tensorName, shape, exponent, size });
-  }
-  const arrays = count
-    ? readArrays(
-        reader,
-        heads.map((head) => head.size),
-        kernels,
-      )
-    : [];
+  const heads = version < FIRST_WITH_ROWS ? readNamed(reader) : readExponents(reader, headTensors(scene));
+  const arrays = heads.length ? readArrays(reader, heads.map(elementsOf), kernels) : [];
   reader.end();
   return new Map(
     heads.map(({ name, shape, exponent }, i) => [name, { shape, exponent, values: arrays[i]! }]),
   );
+}
+
+/** From version 5 on: the scene section says which tensors there are. */
+function readExponents(reader: FieldReader, tensors: TensorShape[]): TensorHead[] {
+  const elements = tensors.reduce((sum, tensor) => sum + elementsOf(tensor), 0);
+  checkElements(elements, reader);
+  return tensors.map((tensor) => ({ ...tensor, exponent: readExponent(reader) }));
+}
+
+function readNamed(reader: FieldReader): TensorHead[] {
+  const count = reader.varint("tensors", 0, MAX_TENSORS);
+  const heads: TensorHead[] = [];
+  let previous: Uint8Array = new Uint8Array(0);
+  let elements = 0;
+  for (let i = 0; i < count; i++) {
+    previous = readName(reader, previous);
+    const name = decodeText(previous, reader);
+    if (heads.some((head) => head.name === name)) reader.refuse(`tensor ${name} is there twice`);
+    const rank = reader.varint("rank", 0, MAX_RANK);
+    const shape: number[] = [];
+    for (let side = 0; side < rank; side++) shape.push(reader.varint("side", 0, MAX_LAYER_WIDTH));
+    const head = { name, shape, exponent: readExponent(reader) };
+    elements += elementsOf(head);
+    checkElements(elements, reader);
+    heads.push(head);
+  }
+  return heads;
+}
+
+function elementsOf({ shape }: TensorShape): number {
+  return shape.reduce((a, b) => a * b, 1);
+}
+
+function checkElements(elements: number, reader: FieldReader): void {
+  if (elements > MAX_WEIGHTS) reader.refuse(`more than ${MAX_WEIGHTS} elements of tensors`);
+}
+
+function readExponent(reader: FieldReader): number {
+  return reader.signedVarint("exponent", -MAX_EXPONENT, MAX_EXPONENT);
 }
 
 function readName(reader: FieldReader, previous: Uint8Array): Uint8Array {

@@ -4,6 +4,7 @@
  */
 
 import type { IntegerNetwork } from "./networks.ts";
+import type { ChunkRows } from "./rows.ts";
 import type { FrequencyTables } from "./tables.ts";
 
 /** In the place of a symbol that is coded as an escape. No table has it. */
@@ -32,13 +33,15 @@ export interface Kernels {
 
   /**
    * Symbols of a chunk of a stream, each with the table that `choices` has for it; ESCAPED for escapes.
-   * `words` are little-endian, four bytes each.
+   * `words` are little-endian, four bytes each. With `rows` tables shift by what their row has shown so far: `choices`
+   * then become the tables that were used.
    */
   decodeChunk(
     words: Uint8Array,
     tables: FrequencyTables,
     choices: Uint8Array,
     symbols: Int32Array,
+    rows: ChunkRows | null,
     section: string,
   ): void;
 

@@ -12,6 +12,7 @@ import { FieldReader } from "./fields.ts";
 import type { Kernels } from "./kernels.ts";
 import { type EarlierAnchors, NEIGHBOUR_INPUTS, type Surroundings, followNeighbours } from "./neighbours.ts";
 import type { IntegerNetwork } from "./networks.ts";
+import { rowsOf, stepsOf } from "./rows.ts";
 import { type GroupShape, Role } from "./scene_section.ts";
 import { readStream } from "./streams.ts";
 import { type FrequencyTables, gaussianTables } from "./tables.ts";
@@ -127,9 +128,11 @@ function readByNetwork(
     const around = surroundings?.around ?? new Int32Array(count); // in the first range nothing is known
     followNeighbours(means, around, centreOf(network), network.follow);
   }
-  const symbols = readStream(reader, gaussianTables(), choices, -MAX_SYMBOL, MAX_SYMBOL, kernels);
+  const rows = rowsOf(network.inertia, group.channels);
+  const symbols = readStream(reader, gaussianTables(), choices, -MAX_SYMBOL, MAX_SYMBOL, kernels, rows);
+  const steps = network.chain ? stepsOf(symbols, group.channels, network.chain, reader) : symbols;
   const latents = means;
-  for (let i = 0; i < count; i++) latents[i] = symbols[i]! * ONE + means[i]!;
+  for (let i = 0; i < count; i++) latents[i] = steps[i]! * ONE + means[i]!;
   return { symbols, latents };
 }
 

@@ -4,7 +4,10 @@ import {
   ACCUMULATOR_LIMIT,
   ACTIVATION_LIMIT,
   BIAS_LIMIT,
+  CHAIN_LIMIT,
+  FIRST_WITH_ROWS,
   FOLLOW_LIMIT,
+  MAX_INERTIA,
   MAX_LAYERS,
   MAX_LAYER_WIDTH,
   MAX_SHIFT,
@@ -15,6 +18,10 @@ import { readArrays } from "./integer_arrays.ts";
 import type { Kernels } from "./kernels.ts";
 import type { GroupShape } from "./scene_section.ts";
 
+/** Flags of a network. */
+const SKIP = 1;
+const CHAIN = 2;
+/** Flags of a layer. */
 const RESERVED_BIT = 0x20;
 const ADDS = 0x40;
 const RECTIFY = 0x80;
@@ -46,12 +53,19 @@ export interface IntegerNetwork {
   skip: boolean;
   /** Null but for a group that sees neighbours. */
   follow: Follow | null;
+  /** For how many symbols of a row what the network expects of their size counts; 0: tables never shift. */
+  inertia: number;
+  /** [channels (channels - 1) / 2] How steps follow those before in their row, in units of 2^-6; or null. */
+  chain: Int32Array | null;
 }
 
 type LayerHead = Omit<IntegerLayer, "weight" | "bias">;
-interface NetworkHead extends Omit<IntegerNetwork, "layers" | "follow"> {
+interface NetworkHead extends Omit<IntegerNetwork, "layers" | "follow" | "chain"> {
   layers: LayerHead[];
   followShift: number | null;
+  hasChain: boolean;
+  /** Of the network's group. */
+  channels: number;
 }
 
 /** For each group its network, or null; and the number of all elements of their weights. */
@@ -59,15 +73,18 @@ export function readNetworks(
   payload: Uint8Array,
   groups: GroupShape[],
   name: string,
+  version: number,
   kernels: Kernels,
 ): { networks: Array<IntegerNetwork | null>; weights: number } {
   const reader = new FieldReader(payload, name);
-  const heads = groups.map((group) => (group.hasNetwork ? readHead(reader, group) : null));
+  const heads = groups.map((group) => (group.hasNetwork ? readHead(reader, group, version) : null));
   const layers = heads.flatMap((head) => head?.layers ?? []);
   const sizes = heads.flatMap((head) => (head ? arraySizes(head) : []));
   const elements = sizes.reduce((a, b) => a + b, 0);
   if (elements > MAX_WEIGHTS)
-    reader.refuse(`${elements} weights, biases and follow, at most ${MAX_WEIGHTS} are allowed`);
+    reader.refuse(
+      `${elements} weights, biases and elements of follow and chain, at most ${MAX_WEIGHTS} are allowed`,
+    );
   const arrays = layers.length ? readArrays(reader, sizes, kernels) : [];
   reader.end();
   let next = 0;
@@ -79,18 +96,23 @@ export function readNetworks(
       next += 4;
       return checked({ ...layer, weight, bias }, reader);
     });
-    const { inputs, outputs, skip, followShift: shift } = head;
+    const { inputs, outputs, skip, inertia, followShift: shift } = head;
     const follow = shift === null ? null : checkedFollow({ weight: arrays[next++]!, shift }, reader);
-    return { inputs, outputs, layers: whole, skip, follow };
+    const chain = head.hasChain ? checkedChain(arrays[next++]!, reader) : null;
+    return { inputs, outputs, layers: whole, skip, follow, inertia, chain };
   });
   return { networks, weights: layers.reduce((sum, layer) => sum + layer.inputs * layer.outputs, 0) };
 }
 
-function readHead(reader: FieldReader, group: GroupShape): NetworkHead {
+function readHead(reader: FieldReader, group: GroupShape, version: number): NetworkHead {
   const count = reader.varint("layers", 1, MAX_LAYERS);
   const flags = reader.u8("flags of a network");
-  if (flags > (count > 1 ? 1 : 0)) reader.refuse(`flags of a network of ${count} layers are ${flags}`);
-  const skip = flags === 1;
+  const hasRows = version >= FIRST_WITH_ROWS;
+  const legal = (count > 1 ? SKIP : 0) | (hasRows && group.channels > 1 ? CHAIN : 0);
+  if (flags & ~legal) {
+    reader.refuse(`flags of a network of ${count} layers for ${group.channels} channels are ${flags}`);
+  }
+  const skip = (flags & SKIP) !== 0;
   const outputs = 2 * group.width;
   const layers: LayerHead[] = [];
   for (let i = 0; i < count; i++) {
@@ -111,18 +133,22 @@ function readHead(reader: FieldReader, group: GroupShape): NetworkHead {
   const followShift = group.seesNeighbours ? reader.u8("follow_shift") : null;
   if (followShift !== null && followShift > MAX_SHIFT)
     reader.refuse(`follow_shift is ${followShift}, expected 0 to ${MAX_SHIFT}`);
-  return { inputs: group.inputs, outputs, layers, skip, followShift };
+  const inertia = hasRows ? reader.u8("inertia") : 0;
+  if (inertia > MAX_INERTIA) reader.refuse(`inertia is ${inertia}, expected 0 to ${MAX_INERTIA}`);
+  const { inputs, channels } = group;
+  return { inputs, outputs, layers, skip, followShift, inertia, hasChain: (flags & CHAIN) !== 0, channels };
 }
 
 /** Of a network's arrays, in the order of the file. */
-function arraySizes({ layers, outputs, followShift }: NetworkHead): number[] {
+function arraySizes({ layers, followShift, hasChain, channels }: NetworkHead): number[] {
   const sizes = layers.flatMap((layer) => {
     const half = Math.ceil(layer.outputs / 2);
     const rest = layer.outputs - half;
     return [half * layer.inputs, rest * layer.inputs, half, rest];
   });
-  // A mean for each channel, and a scale.
-  return followShift === null ? sizes : [...sizes, outputs / 2];
+  if (followShift !== null) sizes.push(channels);
+  if (hasChain) sizes.push((channels * (channels - 1)) / 2);
+  return sizes;
 }
 
 function joined(a: Int32Array, b: Int32Array): Int32Array {
@@ -151,4 +177,12 @@ function checkedFollow(follow: Follow, reader: FieldReader): Follow {
     if (Math.abs(weight) >= FOLLOW_LIMIT) reader.refuse(`an element of follow is ${weight}`);
   }
   return follow;
+}
+
+/** The bound within which the sums of a row are exact. */
+function checkedChain(chain: Int32Array, reader: FieldReader): Int32Array {
+  for (const element of chain) {
+    if (Math.abs(element) >= CHAIN_LIMIT) reader.refuse(`an element of chain is ${element}`);
+  }
+  return chain;
 }

@@ -8,6 +8,7 @@
 import { CorruptSection } from "../errors.ts";
 import { SINGLE_STATE_SYMBOLS } from "./constants.ts";
 import { ESCAPED } from "./kernels.ts";
+import { type ChunkRows, TableShift } from "./rows.ts";
 import type { FrequencyTables } from "./tables.ts";
 
 const WORD = 2 ** 32;
@@ -18,12 +19,14 @@ export function decodeChunk(
   tables: FrequencyTables,
   choices: Uint8Array,
   symbols: Int32Array,
+  rows: ChunkRows | null,
   section: string,
 ): void {
   const view = new DataView(words.buffer, words.byteOffset, words.byteLength);
   const refuse = (problem: string): never => {
     throw new CorruptSection(`${section}: ${problem}`);
   };
+  const tableShift = rows && new TableShift(rows);
   const states = symbols.length < SINGLE_STATE_SYMBOLS ? 1 : 2;
   if (words.length < 8 * states) refuse("a chunk has fewer words than its states need");
   const { base, entries, lowest, frequencies, cumulated, hints } = tables;
@@ -42,7 +45,8 @@ export function decodeChunk(
     const lo = low[which]!;
     const hi = high[which]!;
     const slot = lo & 0xffff;
-    const table = choices[i]!;
+    const given = choices[i]!;
+    const table = tableShift ? tableShift.shifted(given) : given;
     const first = base[table]!;
     const last = entries[table]! - 1;
     let j = hints[256 * table + (slot >> 8)]!;
@@ -62,7 +66,12 @@ export function decodeChunk(
     }
     low[which] = nextLow;
     high[which] = nextHigh;
-    symbols[i] = j === last ? ESCAPED : lowest[table]! + j;
+    const symbol = j === last ? ESCAPED : lowest[table]! + j;
+    symbols[i] = symbol;
+    if (tableShift) {
+      choices[i] = table;
+      tableShift.learn(given, symbol);
+    }
   }
   if (at !== words.length) refuse("words of a chunk are left over");
   for (let i = 0; i < states; i++) {

@@ -112,11 +112,11 @@ export class SceneDecoder {
     const { anchors, coupled, coupledPrimitives, groups } = this.section;
     if (whole) checkSymbols(anchors, groups, bytes);
     this.tables = readTables(tables!.payload, groups, tables!.name, kernels);
-    const read = readNetworks(networks!.payload, groups, networks!.name, kernels);
+    const read = readNetworks(networks!.payload, groups, networks!.name, version, kernels);
     this.networks = read.networks;
     this.networkWeights = read.weights;
     if (whole) checkNetworkProducts(anchors, read.weights, bytes);
-    this.tensors = readHeads(heads!.payload, heads!.name, kernels);
+    this.tensors = readHeads(heads!.payload, this.section, heads!.name, version, kernels);
     this.headElements = [...this.tensors.values()].reduce((sum, tensor) => sum + tensor.values.length, 0);
     if (whole) checkHeadProducts(coupled, this.headElements, bytes);
     if (!positions) {

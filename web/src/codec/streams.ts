@@ -3,11 +3,15 @@
 import { CHUNK_SYMBOLS, MAX_ESCAPE_BYTES } from "./constants.ts";
 import { FieldReader } from "./fields.ts";
 import { ESCAPED, type Kernels } from "./kernels.ts";
+import type { Rows } from "./rows.ts";
 import type { FrequencyTables } from "./tables.ts";
 
 const INT32 = 2 ** 31;
 
-/** Symbols, one for each of `choices`, which names its table; refuses those below `least` or above `most`. */
+/**
+ * Symbols, one for each of `choices`, which names its table; refuses those below `least` or above `most`. With `rows`
+ * tables shift within each row, and `choices` become those that were used: escapes need them.
+ */
 export function readStream(
   reader: FieldReader,
   tables: FrequencyTables,
@@ -15,6 +19,7 @@ export function readStream(
   least: number,
   most: number,
   kernels: Kernels,
+  rows: Rows | null = null,
 ): Int32Array {
   const count = choices.length;
   const symbols = new Int32Array(count);
@@ -33,6 +38,7 @@ export function readStream(
       tables,
       choices.subarray(start, end),
       symbols.subarray(start, end),
+      rows && { ...rows, first: start % rows.channels },
       reader.section,
     );
   });

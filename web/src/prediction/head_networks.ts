@@ -1,31 +1,15 @@
 /** The prediction heads by their layout (docs/bitstream_prediction.md, "Networks of the prediction"). */
 
+import {
+  HEAD_LAYOUTS,
+  type HeadLayout,
+  SHARED_RESIDUALS,
+  headInputs,
+  headTensors,
+} from "../codec/head_tensors.ts";
+import type { Tensor } from "../codec/heads.ts";
 import type { Scene } from "../codec/scene_decoder.ts";
-import { Role, channelsOf } from "../codec/scene_section.ts";
 import { CorruptSection } from "../errors.ts";
-
-/** Numbers of the view embedding: a direction and a distance. */
-export const VIEW = 4;
-export const SHARED_RESIDUALS = "residuals";
-
-interface Layout {
-  seesView: boolean;
-  outputs: number;
-  blocks: number;
-}
-
-const LAYOUTS: Record<Scene["heads"], Record<string, Layout>> = {
-  separate: {
-    translation: { seesView: false, outputs: 3, blocks: 1 },
-    covariance: { seesView: false, outputs: 7, blocks: 1 },
-    opacity: { seesView: true, outputs: 1, blocks: 1 },
-    color: { seesView: true, outputs: 3, blocks: 2 },
-  },
-  paired: {
-    geometry: { seesView: false, outputs: 10, blocks: 1 },
-    appearance: { seesView: true, outputs: 4, blocks: 1 },
-  },
-};
 
 export interface Block {
   weight1: Float32Array;
@@ -56,52 +40,44 @@ export interface Heads {
 
 /** Throws CorruptSection if a tensor is missing, has another shape, or is none of the layout's. */
 export function readHeadNetworks(scene: Scene): Heads {
-  const taken = new Set<string>();
-  const tensor = (name: string, shape: number[]): Float32Array => {
-    const found = scene.tensors.get(name);
-    if (!found) throw new CorruptSection(`prediction heads: tensor ${name} is missing`);
-    if (found.shape.length !== shape.length || found.shape.some((side, i) => side !== shape[i])) {
-      throw new CorruptSection(`prediction heads: ${name} has shape [${found.shape}], expected [${shape}]`);
-    }
-    taken.add(name);
-    const unit = 2 ** -found.exponent;
-    return Float32Array.from(found.values, (value) => value * unit);
-  };
-  const networks: Record<string, HeadNetwork> = {};
-  for (const [name, layout] of Object.entries(LAYOUTS[scene.heads])) {
-    networks[name] = readNetwork(name, layout, scene, tensor);
+  const values = new Map<string, Float32Array>();
+  for (const { name, shape } of headTensors(scene)) {
+    values.set(name, parametersOf(name, scene.tensors.get(name), shape));
   }
-  const isShared = channelsOf(scene.groups, Role.residual) === 0;
-  const shape = [scene.coupledPrimitives, scene.residualDim];
-  const sharedResiduals = isShared ? tensor(SHARED_RESIDUALS, shape) : null;
-  const unknown = [...scene.tensors.keys()].find((name) => !taken.has(name));
+  const unknown = [...scene.tensors.keys()].find((name) => !values.has(name));
   if (unknown !== undefined)
     throw new CorruptSection(`prediction heads: tensor ${unknown} is not of this layout`);
-  return { networks, sharedResiduals };
+  const networks: Record<string, HeadNetwork> = {};
+  for (const [name, layout] of Object.entries(HEAD_LAYOUTS[scene.heads])) {
+    networks[name] = networkOf(layout, scene, (tensor) => values.get(`${name}.${tensor}`)!);
+  }
+  return { networks, sharedResiduals: values.get(SHARED_RESIDUALS) ?? null };
 }
 
-function readNetwork(
-  name: string,
-  { seesView, outputs, blocks }: Layout,
-  scene: Scene,
-  tensor: (name: string, shape: number[]) => Float32Array,
-): HeadNetwork {
-  const { width } = scene;
-  const inputs = scene.referenceDim + (seesView ? VIEW : 0) + scene.residualDim;
+function parametersOf(name: string, tensor: Tensor | undefined, shape: number[]): Float32Array {
+  if (!tensor) throw new CorruptSection(`prediction heads: tensor ${name} is missing`);
+  if (tensor.shape.length !== shape.length || tensor.shape.some((side, i) => side !== shape[i])) {
+    throw new CorruptSection(`prediction heads: ${name} has shape [${tensor.shape}], expected [${shape}]`);
+  }
+  const unit = 2 ** -tensor.exponent;
+  return Float32Array.from(tensor.values, (value) => value * unit);
+}
+
+function networkOf(layout: HeadLayout, scene: Scene, tensor: (name: string) => Float32Array): HeadNetwork {
   return {
-    inputs,
-    width,
-    outputs,
-    inputWeight: tensor(`${name}.input_weight`, [inputs, width]),
-    inputBias: tensor(`${name}.input_bias`, [width]),
-    blocks: Array.from({ length: blocks }, (_, b) => ({
-      weight1: tensor(`${name}.blocks.${b}.weight1`, [width, width]),
-      bias1: tensor(`${name}.blocks.${b}.bias1`, [width]),
-      weight2: tensor(`${name}.blocks.${b}.weight2`, [width, width]),
-      bias2: tensor(`${name}.blocks.${b}.bias2`, [width]),
+    inputs: headInputs(layout, scene),
+    width: scene.width,
+    outputs: layout.outputs,
+    inputWeight: tensor("input_weight"),
+    inputBias: tensor("input_bias"),
+    blocks: Array.from({ length: layout.blocks }, (_, b) => ({
+      weight1: tensor(`blocks.${b}.weight1`),
+      bias1: tensor(`blocks.${b}.bias1`),
+      weight2: tensor(`blocks.${b}.weight2`),
+      bias2: tensor(`blocks.${b}.bias2`),
     })),
-    outputWeight: tensor(`${name}.output_weight`, [width, outputs]),
-    outputBias: tensor(`${name}.output_bias`, [outputs]),
-    skipWeight: tensor(`${name}.skip_weight`, [inputs, outputs]),
+    outputWeight: tensor("output_weight"),
+    outputBias: tensor("output_bias"),
+    skipWeight: tensor("skip_weight"),
   };
 }
