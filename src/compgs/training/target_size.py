@@ -67,16 +67,17 @@ class TargetSize:
         target = max(1, t.target_bytes - fixed)
         return follow(state, size * state.written * state.share, target, progress=step / t.steps, grown=grown)
 
-    def bits_that_stay(self, step: int, bits: Tensor, written: float) -> tuple[float, float]:
+    def bits_that_stay(self, step: int, bits: Tensor) -> tuple[float, float]:
         """Of all `bits` [N] of the anchors, after a pruning at this step: with fewer than the first no lambda would
         bring the file to its size, and with more than the second after the last pruning none would in time.
-        `written`: of the bytes that training pays for, what a file takes.
+
+        As training pays for them: what a file takes less is less of it in the end, when lambda may have risen.
         """
         target = self.config.training.target_bytes
         if target is None:
             return 0.0, math.inf
         drawn = missed(self.contributions(), self.config.control.idle_share)
-        share = (target - fixed_bytes(self.model)) / max(1.0, written * self.size(drawn))
+        share = (target - fixed_bytes(self.model)) / max(1.0, self.size(drawn))
         wanted = share * float(bits.sum(dtype=torch.float64))
         return wanted, SETTLES * wanted if step == max(self.pruned_at) else math.inf
 

@@ -438,10 +438,7 @@ class Trainer:
         """Remove the anchors that are not worth their bits: what is left of the run makes up for them."""
         changes = self.changes(views_to_prune_by(len(self.scene.train_views)))
         bits = anchor_bits(self.model)
-        lmbda, (least, most) = (
-            self.rate.lmbda_of_pruning,
-            self.target_size.bits_that_stay(self.step, bits, self.rate.written),
-        )
+        lmbda, (least, most) = self.rate.lmbda_of_pruning, self.target_size.bits_that_stay(self.step, bits)
         kept = paying(changes, bits, lmbda, self.config.control, self.few, least_bits=least, most_bits=most)
         if kept.any():
             self.control.keep(self.model, self.optimizer, kept)
@@ -519,7 +516,7 @@ class Trainer:
 
     def estimated_bytes(self) -> int:
         """Size of the file if it were written now. Raises TrainingError if the latents are not finite any more."""
-        size = self.target_size.file.latents()
+        size = self.rate.written * self.target_size.file.latents()
         if not math.isfinite(size):
             raise diverged(self.step, "rate", size)
         return int(size) + fixed_bytes(self.model)
