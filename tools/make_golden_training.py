@@ -45,7 +45,7 @@ CONFIG = Config(
         idle_share=0.01,
     ),
     training=TrainingConfig(
-        steps=60, seed=11, target_bytes=2_100, rate_start=0.05, hard_rate=0.75, sparse_adam=True
+        steps=60, seed=11, target_bytes=2_200, rate_start=0.05, hard_rate=0.75, sparse_adam=True
     ),
 )
 

@@ -67,17 +67,18 @@ class TargetSize:
         target = max(1, t.target_bytes - fixed)
         return follow(state, size * state.written * state.share, target, progress=step / t.steps, grown=grown)
 
-    def bits_that_stay(self, step: int, bits: Tensor) -> tuple[float, float]:
+    def bits_that_stay(self, step: int, bits: Tensor, written: float) -> tuple[float, float]:
         """Of all `bits` [N] of the anchors, after a pruning at this step: with fewer than the first no lambda would
         bring the file to its size, and with more than the second after the last pruning none would in time.
 
-        As training pays for them: what a file takes less is less of it in the end, when lambda may have risen.
+        `written`: of the bytes that training pays for, what a file takes as yet. What is saved becomes less as the run
+        settles; reckoned is with half of it (110 kB of plush, 1 500 steps: with all of it +4.4 %, with none -3.9 %).
         """
         target = self.config.training.target_bytes
         if target is None:
             return 0.0, math.inf
         drawn = missed(self.contributions(), self.config.control.idle_share)
-        share = (target - fixed_bytes(self.model)) / max(1.0, self.size(drawn))
+        share = (target - fixed_bytes(self.model)) / max(1.0, 0.5 * (1.0 + written) * self.size(drawn))
         wanted = share * float(bits.sum(dtype=torch.float64))
         return wanted, SETTLES * wanted if step == max(self.pruned_at) else math.inf
 

@@ -438,7 +438,8 @@ class Trainer:
         """Remove the anchors that are not worth their bits: what is left of the run makes up for them."""
         changes = self.changes(views_to_prune_by(len(self.scene.train_views)))
         bits = anchor_bits(self.model)
-        lmbda, (least, most) = self.rate.lmbda_of_pruning, self.target_size.bits_that_stay(self.step, bits)
+        lmbda, written = self.rate.lmbda_of_pruning, self.rate.written
+        least, most = self.target_size.bits_that_stay(self.step, bits, written)
         kept = paying(changes, bits, lmbda, self.config.control, self.few, least_bits=least, most_bits=most)
         if kept.any():
             self.control.keep(self.model, self.optimizer, kept)
