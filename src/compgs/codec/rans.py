@@ -268,18 +268,28 @@ def _decode_one(state, position, end, offset, cumulative, lookup, words):
     return state, position, j
 
 
+@njit(inline="always")
+def _first_states(words, begin, end, single):
+    """(place of the next word, state of the even symbols, of the odd ones); place -1: no encoder writes these."""
+    position = np.int64(begin + (2 if single else 4))
+    even, odd = _INITIAL, _INITIAL
+    if position <= end:
+        even = (np.uint64(words[begin + 1]) << _WORD) | np.uint64(words[begin])
+        if not single:
+            odd = (np.uint64(words[begin + 3]) << _WORD) | np.uint64(words[begin + 2])
+    else:
+        position = np.int64(-1)
+    if (even >> np.uint64(63)) != 0 or (odd >> np.uint64(63)) != 0 or even < _INITIAL or odd < _INITIAL:
+        position = np.int64(-1)
+    return position, even, odd
+
+
 @njit
 def _decode_chunk(words, begin, end, index, lowest, counts, offsets, cumulative, lookup, symbols):
     """Number of escapes, -1 if the words are not what an encoder writes."""
     single = len(symbols) < SINGLE_STATE_SYMBOLS
-    position = begin + (2 if single else 4)
-    if position > end:
-        return -1
-    even = (np.uint64(words[begin + 1]) << _WORD) | np.uint64(words[begin])
-    odd = _INITIAL
-    if not single:
-        odd = (np.uint64(words[begin + 3]) << _WORD) | np.uint64(words[begin + 2])
-    if (even >> np.uint64(63)) != 0 or (odd >> np.uint64(63)) != 0 or even < _INITIAL or odd < _INITIAL:
+    position, even, odd = _first_states(words, begin, end, single)
+    if position < 0:
         return -1
     escapes = 0
     for i in range(len(symbols)):
@@ -317,14 +327,8 @@ def _decode_rows_chunk(
     symbol.
     """
     single = len(symbols) < SINGLE_STATE_SYMBOLS
-    position = begin + (2 if single else 4)
-    if position > end:
-        return -1
-    even = (np.uint64(words[begin + 1]) << _WORD) | np.uint64(words[begin])
-    odd = _INITIAL
-    if not single:
-        odd = (np.uint64(words[begin + 3]) << _WORD) | np.uint64(words[begin + 2])
-    if (even >> np.uint64(63)) != 0 or (odd >> np.uint64(63)) != 0 or even < _INITIAL or odd < _INITIAL:
+    position, even, odd = _first_states(words, begin, end, single)
+    if position < 0:
         return -1
     escapes = 0
     start = np.int64(inertia) << 12
