@@ -72,6 +72,7 @@ PUBLISHED = {
     "training.left_out": 0.0,
     "training.coarse_until": 0.0,
     "training.rate_every": 1,
+    "training.sampled_gradients": 0.0,
     "training.averaged": 0.0,
 }
 

@@ -26,7 +26,8 @@ from compgs.training.trainer import Trainer
 
 GOLDEN = Path(__file__).parent.parent / "tests" / "golden" / "training.json"
 # Everything that a run does is in it: growth and the removal of transparent anchors, pruning, references that turn and
-# lose channels, a size to aim at, primitives left out of steps, noise and then symbols, weights as they are stored.
+# lose channels, a size to aim at, primitives left out of steps, noise and then symbols, weights as they are stored. But
+# for what would make another run of every machine's last bits.
 CONFIG = Config(
     model=ModelConfig(
         coupled_primitives=3, reference_dim=10, residuals=True, residual_dim=4, width=16, voxel_size=0.7
@@ -45,7 +46,14 @@ CONFIG = Config(
         idle_share=0.01,
     ),
     training=TrainingConfig(
-        steps=60, seed=11, target_bytes=2_200, rate_start=0.05, hard_rate=0.75, sparse_adam=True
+        steps=60,
+        seed=11,
+        target_bytes=2_200,
+        rate_start=0.05,
+        rate_every=2,
+        sampled_gradients=0.0,  # which ones are in a sample depends on the last bit of all before them
+        hard_rate=0.75,
+        sparse_adam=True,
     ),
 )
 

@@ -203,13 +203,16 @@ class TrainingConfig:
     # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
     rate_start: Share = 0.1
     # steps between two of which the rate is in the loss, as many times as steps pass: the latents change little from
-    # one to the next, and a step without it takes a tenth less time (not in the paper)
-    rate_every: Annotated[int, Range(1, 1000)] = 2
+    # one to the next, and a step without it takes a sixth less time (not in the paper)
+    rate_every: Annotated[int, Range(1, 1000)] = 4
     # of the steps until which photographs of 160 000 pixels and more are halved, larger ones more than once; 0: never
     # (not in the paper; `training/coarse.py`)
     coarse_until: Share = 0.7
     # (1 - w) L1 + w (1 - SSIM) (3DGS)
     ssim_weight: Share = 0.2
+    # of the mean gradient of a view's primitives: of smaller ones only a sample is led through the prediction networks,
+    # as much larger, on the CPU; 0: all are (not in the paper; `tensors/gradient_sampling.py`)
+    sampled_gradients: Annotated[float, Range(0, 100)] = 1.0
     # mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
     scale_weight: Annotated[float, Range(0, 1e6, below=True)] = 0.01
     # quantization steps per training step

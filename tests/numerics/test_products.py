@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from compgs.numerics.products import multiply
+from compgs.numerics.products import add_product, multiply
 
 
 def made(*shape: int, seed: int = 0) -> np.ndarray:
@@ -18,6 +18,22 @@ def test_every_shape_gives_the_product_and_touches_nothing_else(rows: int, colum
     multiply(a, b, room[1:-1])
     np.testing.assert_allclose(room[1:-1], a.astype(np.float64) @ b, atol=1e-5)
     assert (room[[0, -1]] == 7).all()
+
+
+@pytest.mark.parametrize("rows", [0, 1, 3, 4, 5, 8, 11, 17])
+@pytest.mark.parametrize("columns", [1, 2, 3, 4, 5, 7, 8, 9, 12, 15, 16, 17, 23, 24, 31, 36, 42])
+def test_a_product_is_added_once_to_what_was_there_and_touches_nothing_else(rows: int, columns: int) -> None:
+    a, b, room = made(rows, 9), made(9, columns, seed=1), made(rows + 2, columns, seed=2)
+    before = room.copy()
+    add_product(a, b, room[1:-1])
+    np.testing.assert_allclose(room[1:-1], before[1:-1] + a.astype(np.float64) @ b, atol=1e-5)
+    assert np.array_equal(room[[0, -1]], before[[0, -1]])
+
+
+def test_a_transposed_left_factor_is_read_where_it_is() -> None:
+    x, y, out = made(130, 6), made(130, 20, seed=1), np.zeros((6, 20), np.float32)
+    add_product(x.T, y, out)
+    np.testing.assert_allclose(out, x.T.astype(np.float64) @ y, atol=1e-4)
 
 
 def test_nothing_summed_is_zero() -> None:

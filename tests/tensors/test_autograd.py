@@ -19,9 +19,9 @@ def inputs(dtype):
     return [x.to(dtype).requires_grad_() for x in made]
 
 
-def prediction(dtype, *, revived=False, layout="paired"):
+def prediction(dtype, *, revived=False, layout="paired", kept=1.0):
     """Gaussians and gradients of a random function of them by everything that is trained; `revived`: also of the
-    opacities of what is not drawn.
+    opacities of what is not drawn. `kept`: the share of the Gaussians that it depends on.
     """
     torch.manual_seed(0)
     heads = make_heads(layout, HeadDimensions(D, G, 16)).to(dtype)
@@ -34,7 +34,10 @@ def prediction(dtype, *, revived=False, layout="paired"):
     ]
     g = torch.Generator().manual_seed(2)
     weights = [torch.randn(f.shape, generator=g).to(dtype) for f in fields]
-    total = sum((f * w).sum() for f, w in zip(fields, weights, strict=True))
+    counted = (torch.rand(len(result.index), generator=g) < kept).to(dtype)
+    total = sum(
+        (f * w * counted.view(-1, *[1] * (f.dim() - 1))).sum() for f, w in zip(fields, weights, strict=True)
+    )
     if revived:
         total = total + torch.relu(0.05 - result.opacities).sum()
     total.backward()
@@ -49,6 +52,15 @@ def test_prediction_by_kernels_and_its_gradients_agree_with_float64_autograd(rev
     true_index, true_fields, true_gradients = prediction(torch.float64, revived=revived, layout=layout)
     assert torch.equal(index, true_index) and 100 < len(index) < N * K
     for found, truth in zip(fields + gradients, true_fields + true_gradients, strict=True):
+        assert (found.double() - truth).abs().max() <= 2e-5 * truth.abs().max()
+
+
+@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("kept", [0.3, 0.0])
+def test_primitives_without_gradient_are_passed_over_and_nothing_else_is(kept, layout):
+    _, _, gradients = prediction(torch.float32, layout=layout, kept=kept)
+    _, _, true_gradients = prediction(torch.float64, layout=layout, kept=kept)
+    for found, truth in zip(gradients, true_gradients, strict=True):
         assert (found.double() - truth).abs().max() <= 2e-5 * truth.abs().max()
 
 

@@ -16,8 +16,16 @@ from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
 STEPS = 20
-# Nothing is left to chance: no primitive is left out, and from the first step on the likelihood sees symbols.
-CERTAIN = {"steps": STEPS, "left_out": 0.0, "hard_rate": 0.0, "rate_start": 0.0, "rate_every": 1}
+# Nothing is left to chance: no primitive is left out, no gradient, and from the first step on the likelihood sees
+# symbols.
+CERTAIN = {
+    "steps": STEPS,
+    "left_out": 0.0,
+    "sampled_gradients": 0.0,
+    "hard_rate": 0.0,
+    "rate_start": 0.0,
+    "rate_every": 1,
+}
 
 
 def with_training(config: Config, **settings: object) -> Config:

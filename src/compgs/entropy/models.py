@@ -196,20 +196,17 @@ class EntropyModel(nn.Module):
         file). `network_bits`: the networks' weights as the file will hold them. Where references see neighbours, the
         rate that leads them is that of the hyperprior; the network of the neighbours learns beside it.
         """
-        z = self.reference_context(references)
         code = partial(code_latents, rate=rate, noise=noise, network_bits=network_bits)
-        f_hat, bits_f = code(references, self.reference_context.decoded(z), self.reference_network)
-        neighbours, bits_n = self.neighbour_network, None
+        neighbours, bits, bits_n = self.neighbour_network, {}, None
+        if neighbours is None or rate:
+            z = self.reference_context(references)
+            f_hat, bits_f = code(references, self.reference_context.decoded(z), self.reference_network)
+            bits = {**(self.reference_context.bits(z, noise) if rate else {}), "reference": bits_f}
         if neighbours is not None:
             f_hat, bits_n = neighbours.code(
                 references, around, code, rate=rate, noise=noise, bits=network_bits
             )
-        c_hat, bits_c = code(covariances, f_hat, self.covariance_network)
-        bits = {
-            **(self.reference_context.bits(z, noise) if rate else {}),
-            "reference": bits_f,
-            "covariance": bits_c,
-        }
+        c_hat, bits["covariance"] = code(covariances, f_hat, self.covariance_network)
         g_hat, bits_g = self.code_residuals(residuals, f_hat, code, rate=rate, noise=noise, mask=mask)
         return Quantized(f_hat, c_hat, g_hat, {**bits, **bits_g} if rate else {}, bits_n)
 

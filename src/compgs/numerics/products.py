@@ -1,8 +1,8 @@
 """Products of small matrices in kernels, without BLAS.
 
-`np.dot` in a kernel calls BLAS through scipy, and finds no other: a program that only renders would have to bring
-it. Here a block of ROWS x 16 results stays in vector registers while the sum runs, 0.6 of the rate of OpenBLAS for the
-shapes of the prediction networks (a loop that is left to the compiler: 0.2).
+`np.dot` in a kernel calls BLAS through scipy, and finds no other: a program that only renders would have to bring it,
+and for matrices as small as those of the prediction networks a call takes longer than what it does. Here a block of
+ROWS x 16 results stays in vector registers while the sum runs (docs/results/speed.md).
 
 Each result is summed in the order of the columns of `a`, one fused multiply-add a term: it depends neither on the
 number of rows nor on what else is computed.
@@ -14,29 +14,40 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
 from compgs.numerics.compiled import njit
 
-ROWS = 4  # of a block: with 16 columns each, its sums are half of the vector registers there are
+
+
+def _rows() -> int:
+    """Of a block of 16 columns: eight sums at once, a vector register each, are what hides how long one takes."""
+    features = str(cpu_target.target_context.codegen().magic_tuple()[2])
+    return 8 if "+avx512f" in features else 4
+
+
+ROWS = _rows()  # no result depends on it
 
 _INDEX, _BYTE, _FLOAT = ir.IntType(32), ir.IntType(8), ir.FloatType()
 
 
-def _block(rows: int, columns: int) -> Any:
-    """block(a, b, out, i, j): out[i : i + rows, j : j + columns] = a[i : i + rows] b[:, j : j + columns]."""
+def _block(rows: int, columns: int, *, adds: bool = False) -> Any:
+    """block(a, b, out, i, j): out[i : i + rows, j : j + columns] = a[i : i + rows] b[:, j : j + columns], or += with
+    `adds`.
+    """
 
     def block(typing_context: Any, a: Any, b: Any, out: Any, i: Any, j: Any) -> Any:
         if not all(
             isinstance(t, types.Array) and t.dtype == types.float32 and t.ndim == 2 for t in (a, b, out)
         ):
             return None
-        return types.void(a, b, out, i, j), _generator(rows, columns)
+        return types.void(a, b, out, i, j), _generator(rows, columns, adds)
 
     return intrinsic(block)
 
 
-def _generator(rows: int, columns: int) -> Callable[..., Any]:
+def _generator(rows: int, columns: int, adds: bool) -> Callable[..., Any]:
     vector = ir.VectorType(_FLOAT, columns)
     nothing = ir.Constant(vector, ir.Undefined)
     first_everywhere = ir.Constant(ir.VectorType(_INDEX, columns), [0] * columns)
@@ -58,7 +69,13 @@ def _generator(rows: int, columns: int) -> Callable[..., Any]:
             builder.module, ir.FunctionType(vector, [vector] * 3), f"llvm.fmuladd.v{columns}f32"
         )
         own = [builder.add(i, ir.Constant(i.type, row)) for row in range(rows)]
-        sums = [cgutils.alloca_once_value(builder, ir.Constant(vector, None)) for _ in own]
+        zero = ir.Constant(vector, None)
+        sums = [
+            cgutils.alloca_once_value(
+                builder, builder.load(place(out, row, j, vector), align=4) if adds else zero
+            )
+            for row in own
+        ]
         terms = cgutils.unpack_tuple(builder, a.shape)[1]
         with cgutils.for_range(builder, terms) as loop:
             weights = builder.load(place(b, loop.index, j, vector), align=4)
@@ -76,6 +93,10 @@ def _generator(rows: int, columns: int) -> Callable[..., Any]:
 
 _by_16, _by_8, _by_4, _by_1 = (_block(ROWS, columns) for columns in (16, 8, 4, 1))
 _row_by_16, _row_by_8, _row_by_4, _row_by_1 = (_block(1, columns) for columns in (16, 8, 4, 1))
+_add_by_16, _add_by_8, _add_by_4, _add_by_1 = (_block(ROWS, columns, adds=True) for columns in (16, 8, 4, 1))
+_add_row_by_16, _add_row_by_8, _add_row_by_4, _add_row_by_1 = (
+    _block(1, columns, adds=True) for columns in (16, 8, 4, 1)
+)
 
 
 @njit
@@ -109,4 +130,35 @@ def multiply(a, b, out):  # [N, K], [K, C], [N, C] float32; the columns of b and
             _by_1(a, b, out, i, j)
         for i in range(len(a) - len(a) % ROWS, len(a)):
             _row_by_1(a, b, out, i, j)
+        j += 1
+
+
+@njit
+def add_product(a, b, out):  # [N, K], [K, C], [N, C] float32; the columns of b and out lie side by side
+    """out += a b."""
+    columns = b.shape[1]
+    j = 0
+    while j + 16 <= columns:
+        for i in range(0, len(a) - ROWS + 1, ROWS):
+            _add_by_16(a, b, out, i, j)
+        for i in range(len(a) - len(a) % ROWS, len(a)):
+            _add_row_by_16(a, b, out, i, j)
+        j += 16
+    if j + 8 <= columns:
+        for i in range(0, len(a) - ROWS + 1, ROWS):
+            _add_by_8(a, b, out, i, j)
+        for i in range(len(a) - len(a) % ROWS, len(a)):
+            _add_row_by_8(a, b, out, i, j)
+        j += 8
+    if j + 4 <= columns:
+        for i in range(0, len(a) - ROWS + 1, ROWS):
+            _add_by_4(a, b, out, i, j)
+        for i in range(len(a) - len(a) % ROWS, len(a)):
+            _add_row_by_4(a, b, out, i, j)
+        j += 4
+    while j < columns:
+        for i in range(0, len(a) - ROWS + 1, ROWS):
+            _add_by_1(a, b, out, i, j)
+        for i in range(len(a) - len(a) % ROWS, len(a)):
+            _add_row_by_1(a, b, out, i, j)
         j += 1

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.model import prediction_kernels
+from compgs.model import network_kernels, prediction_kernels
 from compgs.model.arrays import ALL_ROWS, AfterEntry
 from compgs.model.constants import OPACITY_CUTOFF
 from compgs.tensors import residual_mlp_kernels
-from compgs.tensors.residual_mlp_kernels import CHUNKS, chunk_bounds
+from compgs.tensors.residual_mlp_kernels import CHUNKS, chunk_bounds, rows_with_gradient
 
 _Array = np.ndarray
 
@@ -34,7 +34,7 @@ class KernelMLP(torch.autograd.Function):
         shared, residuals, index = shared.contiguous(), residuals.contiguous(), index.contiguous()
         out = residuals.new_empty(len(residuals), weights[-1].shape[1])
         inputs = residuals.detach().numpy(), ALL_ROWS, index.numpy(), shared.detach().numpy()
-        residual_mlp_kernels.forward(*inputs, *_stacked(weights), out.numpy())
+        network_kernels.forward(*inputs, *_stacked(weights), out.numpy())
         ctx.save_for_backward(shared, residuals, index, *weights)
         return out
 
@@ -77,7 +77,7 @@ class PairedPrediction(torch.autograd.Function):
         own = residuals.detach().numpy()
         raw = residuals.new_empty(len(residuals), 4)
         inputs = own, ALL_ROWS, anchor_index.numpy(), seen.detach().numpy()
-        residual_mlp_kernels.forward(*inputs, *_stacked(appearance), raw.numpy())
+        network_kernels.forward(*inputs, *_stacked(appearance), raw.numpy())
         all_opacities = torch.tanh(raw[:, 0])
         drawn = torch.nonzero(all_opacities > OPACITY_CUTOFF).view(-1)
         opacities, colors = all_opacities.index_select(0, drawn), raw.new_empty(len(drawn), 3)
@@ -86,7 +86,7 @@ class PairedPrediction(torch.autograd.Function):
         anchor = anchor_index.index_select(0, drawn)
         raw_geometry = raw.new_empty(len(drawn), 10)
         inputs = own, _rows(drawn, residuals), anchor.numpy(), shared.detach().numpy()
-        residual_mlp_kernels.forward(*inputs, *_stacked(geometry), raw_geometry.numpy())
+        network_kernels.forward(*inputs, *_stacked(geometry), raw_geometry.numpy())
         spread = log_scales.detach().exp() * voxel_size
         means, scales, quaternions = (raw.new_empty(len(drawn), size) for size in (3, 3, 4))
         prediction_kernels.affine_transform(
@@ -204,12 +204,19 @@ def _mlp_gradients(
     want_weights: bool,
 ) -> tuple[Tensor | None, list[Tensor | None]]:
     """Gradients by the anchors' part and by the weights, where wanted."""
-    index, shared = inputs[2], inputs[3]
+    own, rows, index, shared = inputs
+    found = rows_with_gradient(d_out)
+    if len(found) < len(d_out):
+        rows, index, d_out = found if rows is ALL_ROWS else rows[found], index[found], d_out[found]
     d_shared = np.zeros((len(shared) if want_shared else 0, shared.shape[1]), np.float32)
     sizes = [w.numel() for w in weights]
     parts = np.zeros((CHUNKS, sum(sizes) if want_weights else 0), np.float32)
     bounds = chunk_bounds(index, CHUNKS)
-    residual_mlp_kernels.backward(*inputs, *_stacked(weights), d_out, bounds, d_residuals, d_shared, parts)
+    if len(d_out) > 0:  # no rows would mean all of them
+        inputs = own, rows, index, shared
+        residual_mlp_kernels.backward(
+            *inputs, *_stacked(weights), d_out, bounds, d_residuals, d_shared, parts
+        )
     d_weights: list[Tensor | None] = [None] * len(weights)
     if want_weights:
         pieces = torch.from_numpy(parts.sum(0)).split(sizes)

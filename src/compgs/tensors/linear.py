@@ -1,8 +1,8 @@
 """x W + b, with gradients that do not depend on the number of threads.
 
 A weight's gradient is a sum over all rows. BLAS divides such a product among its threads along that sum, so that one
-and two threads round differently, and the same seed gives another file on another machine. Here rows are taken in
-groups, too small for BLAS to divide, and summed in PARTS parts, which are then added in order.
+and two threads round differently, and the same seed gives another file on another machine. Here rows are summed in
+PARTS parts, which are then added in order.
 """
 
 from dataclasses import dataclass
@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from compgs.numerics.compiled import njit, portion
+from compgs.numerics.products import add_product
 
 PARTS = 16
-# Multiplications of a group: OpenBLAS gives a product that small to one thread.
-GROUP_WORK = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -67,14 +66,7 @@ def transposed_product(x: Tensor, y: Tensor) -> Tensor:
 
 @njit(parallel=True)
 def _sum_products(x, y, parts, share):
-    n, size = len(x), x.shape[1] * y.shape[1]
-    rows = max(1, GROUP_WORK // max(1, size))
+    n = len(x)
     for c in portion(len(parts), share):
-        product = np.empty((x.shape[1], y.shape[1]), np.float32)
-        flat, total = product.ravel(), parts[c].ravel()
-        last = n * (c + 1) // len(parts)
-        for p in range(n * c // len(parts), last, rows):
-            q = min(last, p + rows)
-            np.dot(x[p:q].T, y[p:q], product)
-            for i in range(size):
-                total[i] += flat[i]
+        first, last = n * c // len(parts), n * (c + 1) // len(parts)
+        add_product(x[first:last].T, y[first:last], parts[c])

@@ -1,9 +1,8 @@
-"""The residual MLP in training, on the CPU, fused: forward, and backward with recomputation. `residual_mlp.py` is its
+"""The residual MLP in training, on the CPU, fused: backward, with recomputation. `residual_mlp.py` is its
 readable twin, and explains the equations with `model/network_kernels.py`, the kernels of rendering.
 
 Coupled primitives are taken ROWS at a time, so that all activations of a group stay in the core's cache; the products
-are BLAS calls on such groups, which numba takes from scipy (a whole pass takes 0.55 to 0.6 of the time of the same sums
-as loops vectorized by LLVM). Nothing is kept for the backward pass but the inputs: the activations are computed again,
+are `numerics/products.py`. Nothing is kept for the backward pass but the inputs: the activations are computed again,
 group by group.
 
 Gradients of the weights are sums over all primitives: they are accumulated in CHUNKS parts and then added in
@@ -17,7 +16,6 @@ from compgs.model.network_kernels import (
     FASTMATH,
     ROWS,
     SLOPE,
-    TASKS,
     add_leaky,
     add_shared,
     add_two,
@@ -25,6 +23,7 @@ from compgs.model.network_kernels import (
     tiled,
 )
 from compgs.numerics.compiled import njit, portion
+from compgs.numerics.products import add_product, multiply
 
 CHUNKS = 16  # partial sums of a weight gradient
 
@@ -37,61 +36,30 @@ def _leaky_gradient(d, x, n):
 
 
 @njit(fastmath=FASTMATH)
-def _add(x, y, n):
-    """x[:n] += y[:n], flat."""
-    for i in range(n):
-        x[i] += y[i]
-
-
-@njit(fastmath=FASTMATH)
 def activations(residuals, index, shared, residual_entry, weights1, tiles1, weights2, tiles2, first, x, h):
     """One group: fills the last O columns of first [n, H + O], x [blocks + 1, ROWS, H] and h [blocks, ROWS, H]."""
     n, H = residuals.shape[0], weights1.shape[2]
-    np.dot(residuals, residual_entry, first)
+    multiply(residuals, residual_entry, first)
     add_shared(first, shared, index, x[0])
     for b in range(weights1.shape[0]):
-        np.dot(x[b, :n], weights1[b], h[b, :n])
+        multiply(x[b, :n], weights1[b], h[b, :n])
         add_leaky(h[b].ravel(), tiles1[b], n * H)
-        np.dot(h[b, :n], weights2[b], x[b + 1, :n])
+        multiply(h[b, :n], weights2[b], x[b + 1, :n])
         add_two(x[b + 1].ravel(), x[b].ravel(), tiles2[b], n * H)
 
 
-@njit(parallel=True)
-def forward(
-    residuals,  # [P, G] float32
-    rows,  # [M] int64, ascending: those that are computed; [0]: all, M = P
-    index,  # [M] int64: row of shared, ascending
-    shared,  # [A, H + O] float32: the anchor's part of the first layer and of the skip, biases included
-    residual_entry,  # [G, H + O], and so on: of `MLPArrays`
-    weights1,
-    biases1,
-    weights2,
-    biases2,
-    output_weight,
-    out,  # [M, O], written
-    share,
-):
-    M, G, blocks = len(index), len(residual_entry), len(weights1)
-    H, O = output_weight.shape
-    groups = (M + ROWS - 1) // ROWS
-    tasks = min(groups, TASKS)
-    tiles1, tiles2 = tiled(biases1), tiled(biases2)
-    for t in portion(tasks, share):
-        own = np.empty((ROWS, G), np.float32)
-        first = np.empty((ROWS, H + O), np.float32)
-        x = np.empty((blocks + 1, ROWS, H), np.float32)
-        h = np.empty((blocks, ROWS, H), np.float32)
-        for g in range(groups * t // tasks, groups * (t + 1) // tasks):
-            p, q = g * ROWS, min(M, (g + 1) * ROWS)
-            n = q - p
-            taken = chosen_rows(residuals, rows, p, q, own)
-            activations(
-                taken, index[p:q], shared, residual_entry, weights1, tiles1, weights2, tiles2, first[:n], x, h
-            )
-            np.dot(x[blocks, :n], output_weight, out[p:q])
-            for i in range(n):
-                for j in range(O):
-                    out[p + i, j] += first[i, H + j]
+@njit
+def rows_with_gradient(d_out):
+    """[R] int64, ascending: the rows of d_out [M, O] that are not all zero: what the backward pass needs."""
+    rows = np.empty(len(d_out), np.int64)
+    count = 0
+    for i in range(len(d_out)):
+        for j in range(d_out.shape[1]):
+            if d_out[i, j] != np.float32(0):
+                rows[count] = i
+                count += 1
+                break
+    return rows[:count].copy()
 
 
 @njit
@@ -149,7 +117,7 @@ def backward(
     H, O = output_weight.shape
     F = H + O
     want_residuals, want_weights = len(d_residuals) > 0, d_weights.shape[1] > 0
-    # BLAS takes a transposed right factor at half the rate.
+    # Columns of a right factor must lie side by side.
     entry_t, output_t = np.ascontiguousarray(residual_entry.T), np.ascontiguousarray(output_weight.T)
     weights1_t, weights2_t = np.empty_like(weights1), np.empty_like(weights2)
     for b in range(blocks):
@@ -164,12 +132,8 @@ def backward(
         h = np.empty((blocks, ROWS, H), np.float32)
         dx = np.empty((ROWS, H), np.float32)
         dh = np.empty((ROWS, H), np.float32)
-        part = np.empty((ROWS, H), np.float32)
-        part_own = np.empty((ROWS, G), np.float32)
-        product_entry = np.empty((G, F), np.float32)
-        product_block = np.empty((H, H), np.float32)
-        product_output = np.empty((H, O), np.float32)
-        ones, column_sums = np.ones(ROWS, np.float32), np.empty(H, np.float32)
+        part = np.empty((ROWS, G), np.float32)
+        ones = np.ones((1, ROWS), np.float32)
         weights = d_weights[c]
         for p in range(bounds[c], bounds[c + 1], ROWS):
             q = min(bounds[c + 1], p + ROWS)
@@ -179,35 +143,30 @@ def backward(
                 taken, index[p:q], shared, residual_entry, weights1, tiles1, weights2, tiles2, first[:n], x, h
             )
             d = d_out[p:q]
-            np.dot(d, output_t, dx[:n])
+            multiply(d, output_t, dx[:n])
             at = G * F + blocks * 2 * (H * H + H)
             if want_weights:
-                np.dot(x[blocks, :n].T, d, product_output)
-                _add(weights[at:], product_output.ravel(), H * O)
+                add_product(x[blocks, :n].T, d, weights[at : at + H * O].reshape(H, O))
             for b in range(blocks - 1, -1, -1):
                 at -= 2 * (H * H + H)
-                np.dot(dx[:n], weights2_t[b], dh[:n])
+                multiply(dx[:n], weights2_t[b], dh[:n])
                 _leaky_gradient(dh.ravel(), h[b].ravel(), n * H)
                 if want_weights:
-                    np.dot(x[b, :n].T, dh[:n], product_block)
-                    _add(weights[at:], product_block.ravel(), H * H)
-                    np.dot(ones[:n], dh[:n], column_sums)
-                    _add(weights[at + H * H :], column_sums, H)
-                    np.dot(h[b, :n].T, dx[:n], product_block)
-                    _add(weights[at + H * H + H :], product_block.ravel(), H * H)
-                    np.dot(ones[:n], dx[:n], column_sums)
-                    _add(weights[at + 2 * H * H + H :], column_sums, H)
-                np.dot(dh[:n], weights1_t[b], part[:n])
-                _add(dx.ravel(), part.ravel(), n * H)
+                    second = at + H * H + H
+                    add_product(x[b, :n].T, dh[:n], weights[at : at + H * H].reshape(H, H))
+                    add_product(ones[:, :n], dh[:n], weights[at + H * H : second].reshape(1, H))
+                    add_product(h[b, :n].T, dx[:n], weights[second : second + H * H].reshape(H, H))
+                    add_product(
+                        ones[:, :n], dx[:n], weights[second + H * H : second + H * H + H].reshape(1, H)
+                    )
+                add_product(dh[:n], weights1_t[b], dx[:n])
             _first_gradient(first, dx, x[0], d, index[p:q], d_shared)
             if want_weights:
-                np.dot(taken.T, first[:n], product_entry)
-                _add(weights, product_entry.ravel(), G * F)
-            if want_residuals:
-                np.dot(first[:n], entry_t, part_own[:n])
-                if len(rows) == 0:
-                    _add(d_residuals[p:q].ravel(), part_own.ravel(), n * G)
-                else:
-                    for i in range(n):
-                        for j in range(G):
-                            d_residuals[rows[p + i], j] += part_own[i, j]
+                add_product(taken.T, first[:n], weights[: G * F].reshape(G, F))
+            if want_residuals and len(rows) == 0:
+                add_product(first[:n], entry_t, d_residuals[p:q])
+            elif want_residuals:
+                multiply(first[:n], entry_t, part[:n])
+                for i in range(n):
+                    for j in range(G):
+                        d_residuals[rows[p + i], j] += part[i, j]

@@ -29,6 +29,7 @@ from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
+from compgs.tensors.gradient_sampling import with_sampled_gradients
 from compgs.tensors.prediction import (
     Geometry,
     Prediction,
@@ -285,7 +286,9 @@ class Trainer:
     ) -> tuple[Prediction, Gaussians]:
         """What the view may show (Sec. 3.2), and its Gaussians without those that chance leaves out of this step."""
         prediction = self.predict(latents, rows, camera, self.stored, geometry)
-        return prediction, thinned(prediction, self.left_out, noise)
+        gaussians = thinned(prediction, self.left_out, noise)
+        share = self.config.training.sampled_gradients
+        return prediction, with_sampled_gradients(gaussians, share, noise)
 
     def predict(
         self,
