@@ -20,7 +20,6 @@ from numba.extending import intrinsic
 from compgs.numerics.compiled import njit
 
 
-
 def _rows() -> int:
     """Of a block of 16 columns: eight sums at once, a vector register each, are what hides how long one takes."""
     features = str(cpu_target.target_context.codegen().magic_tuple()[2])

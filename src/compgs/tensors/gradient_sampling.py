@@ -31,9 +31,7 @@ def with_sampled_gradients(
     if share <= 0.0 or not runs_in_kernels(g.means.device, g.means.dtype):
         return gaussians
     start = float(noise(g.means.new_empty(1))) + 0.5
-    return Gaussians(
-        *_Sampled.apply(g.means, g.quaternions, g.scales, g.opacities, g.colors, share, start)
-    )
+    return Gaussians(*_Sampled.apply(g.means, g.quaternions, g.scales, g.opacities, g.colors, share, start))
 
 
 class _Sampled(torch.autograd.Function):
@@ -68,10 +66,10 @@ def _sample(gradients, scales, share, start, found):
     means, quaternions, sizes, opacities, colors = gradients
     count = len(opacities)
     shown, placed = np.empty(count, np.float32), np.empty(count, np.float32)
-    all_shown, all_placed = 0.0, 0.0
+    all_shown = all_placed = 0.0
     for i in range(count):
         shown[i] = abs(opacities[i]) + abs(colors[i, 0]) + abs(colors[i, 1]) + abs(colors[i, 2])
-        moved = np.float32(0.0)
+        moved = 0.0
         for c in range(3):
             moved += (abs(means[i, c]) + abs(sizes[i, c])) * scales[i, c]
         placed[i] = moved
