@@ -29,14 +29,21 @@ from compgs.training.trainer import Trainer
 CPU = torch.device("cpu")
 STEPS = 24
 STOPPED_AT = 9
-# Few views, so that some primitives are left out of each step; growth, pruning and turned references are all in it.
+# Few views, so that some primitives are left out of each step; growth, pruning and turned references are all in it. All
+# gradients are: one last bit makes another sample of them, and another run.
 CONFIG = Config(
     model=ModelConfig(coupled_primitives=4, reference_dim=8, residual_dim=8, width=16, voxel_size=0.6),
     control=ControlConfig(
         start=0.2, stop=0.7, every=0.2, minimum_views=2, gradient_threshold=1e-5, opacity_threshold=0.01
     ),
     training=TrainingConfig(
-        steps=STEPS, seed=3, views_per_step=2, exposure=True, left_out=0.1, rate_start=0.0
+        steps=STEPS,
+        seed=3,
+        views_per_step=2,
+        exposure=True,
+        left_out=0.1,
+        sampled_gradients=0.0,
+        rate_start=0.0,
     ),
 )
 TRAINERS: dict[str, Callable[..., Any]] = {"compgs": Trainer, "3dgs": SplatTrainer}

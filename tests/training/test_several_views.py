@@ -17,8 +17,8 @@ from compgs.training.trainer import Trainer
 from compgs.training.views_in_turn import ViewsInTurn
 
 CPU = torch.device("cpu")
-# Nothing is left to chance: no primitive is left out, and the likelihood sees symbols.
-CERTAIN = {"steps": 20, "left_out": 0.0, "hard_rate": 0.0, "rate_start": 0.0}
+# Nothing is left to chance: no primitive is left out, no gradient, and the likelihood sees symbols.
+CERTAIN = {"steps": 20, "left_out": 0.0, "sampled_gradients": 0.0, "hard_rate": 0.0, "rate_start": 0.0}
 
 
 def with_training(config: Config, **settings: object) -> Config:
