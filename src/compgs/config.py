@@ -211,8 +211,9 @@ class TrainingConfig:
     # (1 - w) L1 + w (1 - SSIM) (3DGS)
     ssim_weight: Share = 0.2
     # of the mean gradient of a view's primitives: of smaller ones only a sample is led through the prediction networks,
-    # as much larger, on the CPU; 0: all are (not in the paper; `tensors/gradient_sampling.py`)
-    sampled_gradients: Annotated[float, Range(0, 100)] = 1.0
+    # as much larger, on the CPU; 0: all are; 1 is faster, and loses detail (not in the paper;
+    # `tensors/gradient_sampling.py`)
+    sampled_gradients: Annotated[float, Range(0, 100)] = 0.1
     # mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
     scale_weight: Annotated[float, Range(0, 1e6, below=True)] = 0.01
     # quantization steps per training step
