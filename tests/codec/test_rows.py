@@ -26,6 +26,7 @@ from compgs.codec.rows import (
     chain_length,
     expected_sizes,
     followed_tables,
+    shift_after,
     shift_edges,
     steps_of_rows,
     symbols_of_rows,
@@ -118,7 +119,12 @@ def test_expected_sizes_are_those_of_the_normal_distribution() -> None:
 
 def test_edges_lie_halfway_between_two_tables() -> None:
     d = np.arange(-LARGEST_TABLE_SHIFT, LARGEST_TABLE_SHIFT + 1)
-    assert shift_edges() == pytest.approx(32768 * 2 ** ((d - 0.5) / 12), abs=1)
+    assert shift_edges()[1:-1] == pytest.approx(32768 * 2 ** ((d[1:] - 0.5) / 12), abs=1)
+
+
+def test_no_ratio_leads_beyond_the_largest_shift() -> None:
+    assert shift_after(0, 63 << 12, 0, shift_edges()) == -LARGEST_TABLE_SHIFT
+    assert shift_after(1 << 24, 1 << 12, 0, shift_edges()) == LARGEST_TABLE_SHIFT
 
 
 def gaussian_rows(

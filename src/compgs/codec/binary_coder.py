@@ -47,18 +47,19 @@ def _squash_table() -> NDArray[np.int32]:
     for _ in range(2049):
         below.append((65536 * power + (one + power) // 2) // (one + power))
         power = power * _EXP_MINUS_1_256 >> 64
-    return np.array([below[-x] if x <= 0 else 65536 - below[x] for x in range(-2048, 2048)], np.int32)
+    return np.array([below[-x] if x <= 0 else 65536 - below[x] for x in range(-2048, 2048)], np.uint16)
 
 
+# 16 bits an entry: the four tables share the 32 KiB nearest to a processor with what the contexts have learned.
 SQUASH = _squash_table()  # [4096] logit + 2048 -> p1
 # [4096] p1 >> 4 -> logit: how many entries of SQUASH lie below the middle of the sixteen p1, minus 2048.
 STRETCH = np.clip(np.searchsorted(SQUASH, 16 * np.arange(4096) + 8) - 2048, -LOGIT_LIMIT, LOGIT_LIMIT).astype(
-    np.int32
+    np.int16
 )
 # [1024] how far (in 2**-16) a probability moves towards its n-th decision: floor(65536 / (n + 1.6)).
-RATE = np.array([655360 // (10 * n + 16) for n in range(1024)], np.int32)
+RATE = np.array([655360 // (10 * n + 16) for n in range(1024)], np.uint16)
 # [1024] weight (in 2**-8) of the logit of a context that was seen n times: a new context knows nothing.
-CONFIDENCE = np.array([256 * n // (n + 3) for n in range(1024)], np.int32)
+CONFIDENCE = np.array([256 * n // (n + 3) for n in range(1024)], np.int16)
 
 CODER_FIELDS = 5
 LOW, HIGH, CODE, POSITION, DECODING = range(CODER_FIELDS)
@@ -80,7 +81,7 @@ def make_mixer(sizes: list[int], weight_sets: int, refinements: int, initial_wei
     """A mixer that knows nothing yet. sizes: number of contexts of each input; initial_weight in 2**-16."""
     weights = np.full((weight_sets, len(sizes) + 1), initial_weight, np.int64)
     weights[:, -1] = 0
-    curve = SQUASH[np.minimum(np.arange(33) * 128, 4095)]
+    curve = SQUASH[np.minimum(np.arange(33) * 128, 4095)].astype(np.int32)
     return Mixer(
         states=make_states(sum(sizes)),
         weights=weights,
@@ -174,11 +175,12 @@ def code_bit(coder: NDArray[np.int64], data: NDArray[np.uint8], p1: Int, bit: In
 @njit
 def learn(states: NDArray[np.uint32], index: Int, bit: Int, limit: Int) -> None:
     """Move a state towards a decision, by RATE at first and by RATE[limit] in the end."""
-    state = np.int64(states[index])
+    at = np.uint64(index)
+    state = np.int64(states[at])
     count = state & 1023
     p = state >> COUNT_BITS
-    p += (((bit << 22) - p) * RATE[count]) >> 16
-    states[index] = np.uint32((p << COUNT_BITS) | (count + (1 if count < limit else 0)))
+    p += (((bit << 22) - p) * np.int64(RATE[np.uint64(count)])) >> 16
+    states[at] = np.uint32((p << COUNT_BITS) | (count + (1 if count < limit else 0)))
 
 
 @njit
@@ -197,7 +199,12 @@ def adaptive_bit(
     return bit
 
 
-@njit
+@njit(inline="always")
+def _squashed(logit: Int) -> Int:
+    return np.int64(SQUASH[np.uint64(logit + 2048)])
+
+
+@njit(apart=True)
 def mixed_bit(
     coder: NDArray[np.int64],
     data: NDArray[np.uint8],
@@ -216,35 +223,39 @@ def mixed_bit(
     states' counts, at most 1023; rate: of the weights, in 2**-16.
     """
     inputs = len(mixer.contexts)
-    logits = mixer.logits
-    sum1 = mixer.weights[first, inputs] << 8
-    sum2 = mixer.weights[second, inputs] << 8
-    for k in range(inputs):
-        state = np.int64(mixer.states[mixer.contexts[k]])
-        logit = (STRETCH[state >> 20] * CONFIDENCE[state & 1023]) >> 8
+    states, contexts, logits = mixer.states, mixer.contexts, mixer.logits
+    weights1, weights2 = mixer.weights[first], mixer.weights[second]
+    refinement = mixer.refinement[refine]
+    sum1 = weights1[inputs] << 8
+    sum2 = weights2[inputs] << 8
+    for i in range(inputs):
+        k = np.uint64(i)  # an index that may be negative is asked about its sign each time
+        state = np.int64(states[np.uint64(contexts[k])])
+        logit = (
+            np.int64(STRETCH[np.uint64(state >> 20)]) * np.int64(CONFIDENCE[np.uint64(state & 1023)])
+        ) >> 8
         logits[k] = logit
-        sum1 += mixer.weights[first, k] * logit
-        sum2 += mixer.weights[second, k] * logit
+        sum1 += weights1[k] * logit
+        sum2 += weights2[k] * logit
     logits[inputs] = 256
     logit1 = min(max(sum1 >> 16, -LOGIT_LIMIT), LOGIT_LIMIT)
     logit2 = min(max(sum2 >> 16, -LOGIT_LIMIT), LOGIT_LIMIT)
     logit = (logit1 + logit2) >> 1
     place = (logit + 2048) * 32
-    left = place >> 12
+    left, right = np.uint64(place >> 12), np.uint64((place >> 12) + 1)
     share = place & 4095
-    refined = (
-        mixer.refinement[refine, left] * (4096 - share) + mixer.refinement[refine, left + 1] * share
-    ) >> 12
-    p1 = min(max((SQUASH[logit + 2048] + refined) >> 1, MINIMUM_P1), 65536 - MINIMUM_P1)
+    refined = (np.int64(refinement[left]) * (4096 - share) + np.int64(refinement[right]) * share) >> 12
+    p1 = min(max((_squashed(logit) + refined) >> 1, MINIMUM_P1), 65536 - MINIMUM_P1)
     bit = code_bit(coder, data, p1, bit)
     target = 65535 * bit
-    error1 = (target - SQUASH[logit1 + 2048]) * rate
-    error2 = (target - SQUASH[logit2 + 2048]) * rate
-    for k in range(inputs + 1):
-        mixer.weights[first, k] += (logits[k] * error1 + 32768) >> 16
-        mixer.weights[second, k] += (logits[k] * error2 + 32768) >> 16
-    for k in range(inputs):
-        learn(mixer.states, mixer.contexts[k], bit, limit)
-    mixer.refinement[refine, left] += ((target - mixer.refinement[refine, left]) * (4096 - share)) >> 18
-    mixer.refinement[refine, left + 1] += ((target - mixer.refinement[refine, left + 1]) * share) >> 18
+    error1 = (target - _squashed(logit1)) * rate
+    error2 = (target - _squashed(logit2)) * rate
+    for i in range(inputs + 1):
+        k = np.uint64(i)
+        weights1[k] += (logits[k] * error1 + 32768) >> 16
+        weights2[k] += (logits[k] * error2 + 32768) >> 16
+    for i in range(inputs):
+        learn(states, contexts[np.uint64(i)], bit, limit)
+    refinement[left] += ((target - np.int64(refinement[left])) * (4096 - share)) >> 18
+    refinement[right] += ((target - np.int64(refinement[right])) * share) >> 18
     return bit

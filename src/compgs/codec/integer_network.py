@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compgs.codec.rows import NOTHING, RowContext
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import njit, portion, rows_a_thread
 
 FRACTION_BITS = 12
 ACTIVATION_LIMIT = 1 << 23  # activations are in [-2^23, 2^23 - 1]
@@ -165,7 +165,7 @@ def follow_neighbours(network: IntegerNetwork, around: np.ndarray, means: np.nda
     _follow(follow.weight.astype(np.int64), half, follow.shift, centre_of(network), around, means)
 
 
-@njit(parallel=True)
+@njit(parallel=True, worth=rows_a_thread(2048))
 def _follow(weight, half, shift, centre, around, means, share):
     rounding = 1 << (FRACTION_BITS - 1)
     for n in portion(len(means), share):
@@ -238,7 +238,7 @@ def _activation(a, bias, half, scale, rectify):
     return min(max(y, -float(ACTIVATION_LIMIT)), float(ACTIVATION_LIMIT - 1))
 
 
-@njit(parallel=True)
+@njit(parallel=True, worth=rows_a_thread(512))
 def _layer(x, weight, bias, shift, rectify, added, out, share):
     """added [N, out] or [0, out]: nothing."""
     scale = 1.0 / (1 << shift)
@@ -255,7 +255,7 @@ def _layer(x, weight, bias, shift, rectify, added, out, share):
                 out[n, c] = np.int32(y)
 
 
-@njit(parallel=True)
+@njit(parallel=True, worth=rows_a_thread(512))
 def _parameters(x, weight, bias, shift, rectify, mask, rows, means, index, share):
     scale = 1.0 / (1 << shift)
     half = float(1 << (shift - 1)) if shift > 0 else 0.0

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from compgs.codec.integer_network import ACTIVATION_LIMIT, FRACTION_BITS, IntegerNetwork, centre_of
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import njit, portion, rows_a_thread
 from compgs.ordering.neighbours import AROUND, BESIDES, NEAREST_WEIGHT, Neighbours
 
 
@@ -32,7 +32,7 @@ def neighbour_context(
     return out
 
 
-@njit(parallel=True)
+@njit(parallel=True, worth=rows_a_thread(512))
 def _deviate(earlier, centre, deviations, sizes, share):
     """How far latents are from the centre, in each channel and on average."""
     channels = len(centre)
@@ -45,7 +45,7 @@ def _deviate(earlier, centre, deviations, sizes, share):
         sizes[j] = np.int64(size) // channels
 
 
-@njit(parallel=True)
+@njit(parallel=True, worth=rows_a_thread(512))
 def _say(node, around, offsets, deviations, sizes, out, share):
     known, channels = deviations.shape
     sums = np.empty(channels)
@@ -70,5 +70,12 @@ def _say(node, around, offsets, deviations, sizes, out, share):
                 sums[c] += factor * deviations[j, c]
         out[i, 0] = 1 << FRACTION_BITS
         out[i, 1] = activity // weights
+        # Rounded down, as whole numbers are divided, which would take as long as all else here.
+        divisor = float(weights)
+        inverse = 1.0 / divisor
         for c in range(channels):
-            out[i, 2 + c] = np.int64(sums[c]) // weights
+            quotient = np.floor(sums[c] * inverse)  # at most one too large or too small
+            left = sums[c] - quotient * divisor
+            out[i, 2 + c] = np.int32(
+                quotient + (1.0 if left >= divisor else 0.0) - (1.0 if left < 0.0 else 0.0)
+            )

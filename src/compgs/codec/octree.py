@@ -46,6 +46,7 @@ from compgs.ordering.order import (
     inv_morton_codes,
     morton_levels,
     octree_depth,
+    octree_origin,
     sorted_morton,
 )
 
@@ -100,8 +101,22 @@ def _child_tables() -> tuple[NDArray[np.uint64], NDArray[np.int64], NDArray[np.i
     return around, faces, touch
 
 
+def _where_table() -> NDArray[np.int64]:
+    """[8, 27] where neighbour j of a node that is child c of its parent is found: 8 b + place in its block, where the
+    bits of b (x, y, z) say on which axes that is another block than the node's own.
+    """
+    where = np.zeros((8, 27), np.int64)
+    for c in range(8):
+        for j, (dx, dy, dz) in enumerate(_STEPS):
+            x, y, z = (c >> 2) + dx, ((c >> 1) & 1) + dy, (c & 1) + dz  # -1 and 2 lie in another block
+            block = (4 if x & 2 else 0) | (2 if y & 2 else 0) | (1 if z & 2 else 0)
+            where[c, j] = 8 * block + (((x & 1) << 2) | ((y & 1) << 1) | (z & 1))
+    return where
+
+
 _SPREAD = _spread_table()
 _AROUND, _FACES, _TOUCH = _child_tables()
+_WHERE = _where_table()
 
 # Dilated integers: the bits of one axis in a Morton code, x first, and a step of one along it.
 _AXIS_BITS = np.array([0x4924924924924924, 0x2492492492492492, 0x1249249249249249], np.int64)
@@ -137,17 +152,18 @@ def _cell_state(filled: np.uint64, unknown: np.uint64, cell: Int) -> Int:
 
 # What is at a place: 0 no node; otherwise a kind, with the occupancy of its children where that is known.
 _SINGLE, _CODED, _WAITING = 256, 512, 1024
+_WAITING_BIT = 10
 
 
 class Level(NamedTuple):
-    """Nodes of the level that is being walked, in blocks of the eight children of one parent."""
+    """Nodes of the level that is being walked, in blocks of the eight children of one parent. Block 0 is empty: it
+    stands for those that do not exist, so that nobody has to ask.
+    """
 
     salt: np.uint64  # odd, different at each call: no file can be made that fills the hash table badly
-    slots: NDArray[
-        np.int32
-    ]  # [S] open-addressed hash table: 1 + block, 0 free; S is a power of two, S >= 2 N
-    parents: NDArray[np.int64]  # [N] Morton code of each block's parent
-    places: NDArray[np.int16]  # [8 N] what is where: place = 8 * block + child index
+    slots: NDArray[np.int32]  # [S] open-addressed hash table: block, 0 free; S is a power of two, S >= 2 N
+    parents: NDArray[np.int64]  # [N + 1] Morton code of each block's parent
+    places: NDArray[np.int16]  # [8 (N + 1)] what is where: place = 8 * block + child index
 
 
 @njit
@@ -156,20 +172,20 @@ def _slot(level: Level, mask: Int, parent: Int) -> Int:
     mixed = np.uint64(parent) * level.salt
     mixed = (mixed ^ (mixed >> np.uint64(32))) * level.salt
     i = np.int64(mixed >> np.uint64(33)) & mask
-    while level.slots[i] != 0 and level.parents[level.slots[i] - 1] != parent:
+    while level.slots[i] != 0 and level.parents[level.slots[i]] != parent:
         i = (i + 1) & mask
     return i
 
 
 @njit
 def _place(level: Level, mask: Int, blocks: Int, node: Int) -> Int:
-    """Place of a node, in a new block (number `blocks`) if its parent has none yet."""
+    """Place of a node, in a new block behind the `blocks` that there are if its parent has none yet."""
     i = _slot(level, mask, node >> 3)
     if level.slots[i] == 0:
         level.slots[i] = blocks + 1
-        level.parents[blocks] = node >> 3
-        level.places[8 * blocks : 8 * blocks + 8] = 0
-    return 8 * (np.int64(level.slots[i]) - 1) + (node & 7)
+        level.parents[blocks + 1] = node >> 3
+        level.places[8 * blocks + 8 : 8 * blocks + 16] = 0
+    return 8 * np.int64(level.slots[i]) + (node & 7)
 
 
 @njit
@@ -185,15 +201,16 @@ def _start_level(
     while slots < 2 * (len(nodes) + len(singles)):
         slots *= 2
     level.slots[:slots] = 0
+    level.places[:8] = 0
     blocks: Int = 0
     for i in range(len(nodes)):
         place[i] = _place(level, slots - 1, blocks, nodes[i])
-        blocks = max(blocks, (place[i] >> 3) + 1)
+        blocks = max(blocks, place[i] >> 3)
         level.places[place[i]] = _WAITING
     for i in range(len(singles)):
         child = singles[i] >> (3 * height)
         at = _place(level, slots - 1, blocks, child >> 3)
-        blocks = max(blocks, (at >> 3) + 1)
+        blocks = max(blocks, at >> 3)
         level.places[at] = _SINGLE | (1 << (child & 7))
     return slots - 1
 
@@ -203,42 +220,30 @@ def _look_around(
     level: Level,
     mask: Int,
     node: Int,
-    place: Int,
-    near: NDArray[np.int64],  # [27] out: 1 where a neighbour is
     blocks: NDArray[np.int64],  # [8] scratch
 ) -> tuple[np.uint64, np.uint64, Int, Int]:
-    """Occupied cells, unknown cells, number of neighbours, number of those that are not single anchors."""
+    """Occupied cells, unknown cells, which neighbours there are (bit j), and which of them are not single anchors."""
     # The 26 neighbours lie in eight blocks on the node's side of its parent; b: on which axes they differ.
     for b in range(8):
         parent = node >> 3
         for axis in range(3):
             if (b >> (2 - axis)) & 1:
                 parent = _moved(parent, axis, (node >> (2 - axis)) & 1 == 1)
-        blocks[b] = np.int64(level.slots[_slot(level, mask, parent)]) - 1
+        blocks[b] = 8 * np.int64(level.slots[_slot(level, mask, parent)])
     filled = np.uint64(0)
-    unknown = _SPREAD[13, 255]
-    neighbours = 0
-    crowds = 0
+    unknown = np.uint64(0)
+    near: Int = 0
+    crowds: Int = 0
+    # Without a branch: what is next to a node cannot be foretold, and each wrong guess would cost as much as all this.
     for j in range(27):
-        near[j] = 0
-        # -1 and 2 lie in another block than the node, 0 and 1 in the same.
-        x = ((node >> 2) & 1) + j // 9 - 1
-        y = ((node >> 1) & 1) + (j // 3) % 3 - 1
-        z = (node & 1) + j % 3 - 1
-        block = blocks[((x & 2) << 1) | (y & 2) | ((z & 2) >> 1)]
-        if block < 0 or j == 13:
-            continue
-        what = np.int64(level.places[8 * block + (((x & 1) << 2) | ((y & 1) << 1) | (z & 1))])
-        if what == 0:
-            continue
-        near[j] = 1
-        neighbours += 1
-        crowds += 0 if what & _SINGLE else 1
-        if what & _WAITING:
-            unknown |= _SPREAD[j, 255]
-        else:
-            filled |= _SPREAD[j, what & 255]
-    return filled, unknown, neighbours, crowds
+        where = _WHERE[node & 7, j]
+        what = np.int64(level.places[blocks[where >> 3] + (where & 7)])
+        filled |= _SPREAD[j, what & 255]
+        unknown |= _SPREAD[j, 255 * ((what >> _WAITING_BIT) & 1)]
+        near |= np.int64(what != 0) << j
+        crowds |= np.int64(what >= _CODED) << j
+    own = ~(1 << 13)
+    return filled, unknown, near & own, crowds & own
 
 
 # ---- single anchors
@@ -334,7 +339,6 @@ def _walk(
     if count == 1:
         found[0] = _code_single(coder, data, models.direct, 0 if decoding else codes[0], depth, sides)
         return True
-    near = np.zeros(27, np.int64)
     blocks = np.zeros(8, np.int64)
     children_first = np.zeros(9, np.int64)
     occupancy, single = models.occupancy, models.single
@@ -360,8 +364,10 @@ def _walk(
                     while child_first < count and codes[child_first] >> (3 * height) == 8 * node + c:
                         child_first += 1
                 children_first[8] = child_first
-            filled, unknown, neighbours, crowds = _look_around(level, mask, node, place[i], near, blocks)
-            faces = near[4] | near[22] << 1 | near[10] << 2 | near[16] << 3 | near[12] << 4 | near[14] << 5
+            filled, unknown, near, crowded = _look_around(level, mask, node, blocks)
+            neighbours, crowds = _ones(np.uint64(near)), _ones(np.uint64(crowded))
+            faces = (near >> 4 & 1) | (near >> 22 & 1) << 1 | (near >> 10 & 1) << 2
+            faces |= (near >> 16 & 1) << 3 | (near >> 12 & 1) << 4 | (near >> 14 & 1) << 5
             parents_children = np.int64(input.family[i]) & 255
             index = np.int64(input.family[i]) >> 8
             siblings = _ones(np.uint64(parents_children)) - 1
@@ -389,7 +395,7 @@ def _walk(
                         sides_state = 3 * sides_state + _cell_state(filled, unknown, _FACES[c, k])
                     touching: Int = 0
                     for k in range(7):
-                        touching |= near[_TOUCH[c, k]] << k
+                        touching |= (near >> _TOUCH[c, k] & 1) << k
                     at = occupancy.contexts
                     at[0] = _OCCUPANCY_BASE[0] + 256 * scale_grid + prefix
                     at[1] = _OCCUPANCY_BASE[1] + (8 * sides_state + c) * 5 + few
@@ -489,8 +495,8 @@ def _code_tree(
     level = Level(
         salt=np.uint64(int.from_bytes(os.urandom(8), "little") | 1),
         slots=np.empty(max(16, 1 << (2 * count - 1).bit_length()), np.int32),
-        parents=np.empty(count, np.int64),
-        places=np.empty(8 * count, np.int16),
+        parents=np.empty(count + 1, np.int64),
+        places=np.empty(8 * count + 8, np.int16),
     )
     frontiers = [
         Frontier(np.empty(half, np.int64), np.empty(half, np.int32), np.empty(half, np.int16)) for _ in "ab"
@@ -559,10 +565,10 @@ def decode_positions(data: bytes, count: int) -> NDArray[np.int32]:
         raise CorruptSection(
             f"anchor positions: the data are not those of {count} anchors; the file is damaged"
         )
-    codes.sort()
+    codes.sort(kind="stable")  # ascending runs: that they are is seen by this sort alone
     offsets = inv_morton_codes(codes[np.argsort(morton_levels(codes, depth), kind="stable")])
     coordinates = offsets + origin
-    if (offsets.min(axis=0) >> ALIGNMENT_BITS).any() or octree_depth(offsets) != depth:
+    if octree_origin(offsets).any() or octree_depth(offsets) != depth:
         raise CorruptSection("anchor positions: the octree is larger than its anchors; the file is damaged")
     if coordinates.max() > np.iinfo(np.int32).max:
         raise CorruptSection("anchor positions: coordinates beyond 32 bits; the file is damaged")

@@ -41,6 +41,7 @@ _PRECISION = np.uint64(PRECISION_BITS)
 _SLOT = np.uint64((1 << PRECISION_BITS) - 1)
 _LOOKUP = np.uint64(PRECISION_BITS - LOOKUP_BITS)
 _WORD = np.uint64(32)
+_ONE = np.uint64(1)
 _LOW_WORD = np.uint64((1 << 32) - 1)
 _FULL = np.uint64(63 - PRECISION_BITS)  # a state of frequency << 47 or more would leave 63 bits when coded
 # Stands for an escaped symbol until its value is read; no table holds it.
@@ -252,20 +253,21 @@ def _decode_one(state, position, end, offset, cumulative, lookup, words):
     there.
     """
     slot = state & _SLOT
-    j = np.int64(lookup[np.int64(slot >> _LOOKUP)])
+    at = np.uint64(offset)
+    place = at + np.uint64(lookup[slot >> _LOOKUP])
     slot32 = np.uint32(slot)
-    while cumulative[offset + j + 1] <= slot32:  # ends at the latest at the table's last entry, 65536
-        j += 1
-    start = np.uint64(cumulative[offset + j])
-    frequency = np.uint64(cumulative[offset + j + 1]) - start
+    while cumulative[place + _ONE] <= slot32:  # ends at the latest at the table's last entry, 65536
+        place += _ONE
+    start = np.uint64(cumulative[place])
+    frequency = np.uint64(cumulative[place + _ONE]) - start
     state = frequency * (state >> _PRECISION) + slot - start
     if state < _INITIAL:
         if position < end:
-            state = (state << _WORD) | np.uint64(words[position])
+            state = (state << _WORD) | np.uint64(words[np.uint64(position)])
             position += 1
         else:
             position = end + 1
-    return state, position, j
+    return state, position, np.int64(place - at)
 
 
 @njit(inline="always")
@@ -284,7 +286,7 @@ def _first_states(words, begin, end, single):
     return position, even, odd
 
 
-@njit
+@njit(apart=True)
 def _decode_chunk(words, begin, end, index, lowest, counts, offsets, cumulative, lookup, symbols):
     """Number of escapes, -1 if the words are not what an encoder writes."""
     single = len(symbols) < SINGLE_STATE_SYMBOLS
@@ -293,7 +295,7 @@ def _decode_chunk(words, begin, end, index, lowest, counts, offsets, cumulative,
         return -1
     escapes = 0
     for i in range(len(symbols)):
-        t = index[i]
+        t = np.uint64(index[i])
         if single or (i & 1) == 0:
             even, position, j = _decode_one(even, position, end, offsets[t], cumulative, lookup[t], words)
         else:
@@ -319,7 +321,7 @@ def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, look
         )  # fmt: skip
 
 
-@njit
+@njit(apart=True)
 def _decode_rows_chunk(
     words, begin, end, index, lowest, counts, offsets, cumulative, lookup, first, width, inertia, known, edges, symbols
 ):  # fmt: skip
@@ -337,7 +339,7 @@ def _decode_rows_chunk(
         if channel == width:
             seen, expected, shift, channel = start, start, np.int64(0), 0
         given = np.int64(index[i])
-        t = shifted(given, shift)
+        t = np.uint64(shifted(given, shift))  # as an index: one that may be negative is asked about its sign
         index[i] = np.uint8(t)
         if single or (i & 1) == 0:
             even, position, j = _decode_one(even, position, end, offsets[t], cumulative, lookup[t], words)

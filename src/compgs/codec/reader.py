@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,8 +45,8 @@ from compgs.codec.mask_coder import decode_masks
 from compgs.codec.octree import decode_positions
 from compgs.codec.sections import SceneSection, decode_metadata, decode_scene, decode_tables
 from compgs.codec.tmc3 import decode_positions_tmc3
-from compgs.codec.viewpoints import decode_viewpoints
-from compgs.codec.weights import decode_heads, decode_known_heads, decode_networks
+from compgs.codec.viewpoints import Viewpoints, decode_viewpoints
+from compgs.codec.weights import QuantizedTensor, decode_heads, decode_known_heads, decode_networks
 from compgs.errors import CorruptSection
 from compgs.numerics.crew import CREW
 from compgs.ordering.order import level_counts, represented
@@ -143,36 +144,14 @@ def read_latents(
     if any(by_number.get(PADDING, b"")):
         raise CorruptSection(f"{SECTION_NAMES[PADDING]}: expected zero bytes")
     metadata = decode_metadata(by_number[METADATA], SECTION_NAMES[METADATA]) if METADATA in by_number else {}
-    viewpoints = None
-    if VIEWPOINTS in by_number:
-        viewpoints = decode_viewpoints(by_number[VIEWPOINTS], SECTION_NAMES[VIEWPOINTS])
-    tables = decode_tables(by_number[TABLES], SECTION_NAMES[TABLES], d.table_count)
-
-    def check_products(limit: tuple[str, int, int], rows: int, number: int, weights: int) -> None:
-        check_amount(limit, rows * weights, len(data), SECTION_NAMES[number])
-
-    networks = decode_networks(
-        by_number[NETWORKS],
-        SECTION_NAMES[NETWORKS],
-        d.network_sizes,
-        partial(check_products, NETWORK_PRODUCTS, anchors, NETWORKS),
-        d.networks_that_follow,
-        d.channels_of_networks,
-        version,
-    )
     coupled = sum(head.coupled for head in heads_of_ranges) if prefix else scene.coupled
-    check_heads = partial(check_products, HEAD_PRODUCTS, coupled, HEADS)
-    if version >= FIRST_WITH_ROWS:
-        heads = decode_known_heads(by_number[HEADS], SECTION_NAMES[HEADS], d.head_shapes, check_heads)
-    else:
-        heads = decode_heads(by_number[HEADS], SECTION_NAMES[HEADS], check_heads)
-    priors = _priors(d, iter(networks), iter(tables))
     read_positions = partial(_positions, by_number, scene.anchors)
-    read_masks = partial(decode_masks, by_number[MASKS], scene.anchors, d.coupled_primitives)
+    read_others = partial(_others, by_number, scene, version, anchors, coupled, len(data))
     if prefix:  # only the positions prove that there are so many anchors
-        coordinates, mask = read_positions(), read_masks()
+        coordinates, others = read_positions(), read_others()
     else:
-        coordinates, mask = CREW.both(read_positions, read_masks)
+        coordinates, others = CREW.both(read_positions, read_others)
+    mask, priors = others.mask, others.priors
     if int(mask.sum()) != scene.coupled:
         raise CorruptSection(
             f"masks: {int(mask.sum())} coupled primitives exist, the scene section promises {scene.coupled}"
@@ -198,13 +177,57 @@ def read_latents(
         coordinates=coordinates,
         mask=mask,
         groups=tuple(map(Group, d.groups, priors, all_symbols)),
-        heads=heads,
-        viewpoints=viewpoints,
+        heads=others.heads,
+        viewpoints=others.viewpoints,
         levels=known.levels if whole else None,
         stands_for=stands_for,
         metadata=metadata,
     )
     return content, latents
+
+
+class _Others(NamedTuple):
+    """What a decoder may read while it reads the positions."""
+
+    viewpoints: Viewpoints | None
+    priors: list[Prior]
+    heads: tuple[tuple[str, QuantizedTensor], ...]
+    mask: np.ndarray  # [N, K] bool
+
+
+def _others(
+    sections: dict[int, bytes],
+    scene: SceneSection,
+    version: int,
+    anchors: int,  # that have arrived
+    coupled: int,  # coupled primitives of these
+    file_bytes: int,
+) -> _Others:
+    d = scene.dimensions
+    viewpoints = None
+    if VIEWPOINTS in sections:
+        viewpoints = decode_viewpoints(sections[VIEWPOINTS], SECTION_NAMES[VIEWPOINTS])
+    tables = decode_tables(sections[TABLES], SECTION_NAMES[TABLES], d.table_count)
+
+    def check_products(limit: tuple[str, int, int], rows: int, number: int, weights: int) -> None:
+        check_amount(limit, rows * weights, file_bytes, SECTION_NAMES[number])
+
+    networks = decode_networks(
+        sections[NETWORKS],
+        SECTION_NAMES[NETWORKS],
+        d.network_sizes,
+        partial(check_products, NETWORK_PRODUCTS, anchors, NETWORKS),
+        d.networks_that_follow,
+        d.channels_of_networks,
+        version,
+    )
+    check_heads = partial(check_products, HEAD_PRODUCTS, coupled, HEADS)
+    if version >= FIRST_WITH_ROWS:
+        heads = decode_known_heads(sections[HEADS], SECTION_NAMES[HEADS], d.head_shapes, check_heads)
+    else:
+        heads = decode_heads(sections[HEADS], SECTION_NAMES[HEADS], check_heads)
+    mask = decode_masks(sections[MASKS], scene.anchors, d.coupled_primitives)
+    return _Others(viewpoints, _priors(d, iter(networks), iter(tables)), heads, mask)
 
 
 def _positions(sections: dict[int, bytes], anchors: int) -> np.ndarray:  # [N, 3] int32

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from compgs.codec.tables import GAUSSIAN_COUNT, SCALES_PER_OCTAVE, FrequencyTables, gaussian_tables
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import njit, portion, rows_a_thread
 
 CHAIN_BITS = (
     6  # elements of a chain are in units of 2^-6: finer ones move no step of the files that were tried
@@ -76,7 +76,7 @@ def _along(chain: np.ndarray, given: np.ndarray, sign: int) -> np.ndarray:
     return out
 
 
-@njit(parallel=True)
+@njit(parallel=True, worth=rows_a_thread(512))
 def _follow_chain(chain, given, sign, out, share):
     """Steps from symbols (sign 1), where those before are in `out` already, or symbols from steps (-1)."""
     lowest, highest = np.int64(-(1 << 31)), np.int64((1 << 31) - 1)
@@ -126,11 +126,13 @@ def evidence() -> Evidence:
 
 
 @cache
-def shift_edges() -> np.ndarray:  # [2 LARGEST_TABLE_SHIFT + 1] int64
-    """Of each shift, from the lowest on: from which ratio of sizes on, seen to expected, in 2^-15."""
+def shift_edges() -> np.ndarray:  # [2 LARGEST_TABLE_SHIFT + 2] int64
+    """Of each shift, from the lowest on: from which ratio of sizes on, seen to expected, in 2^-15. Below the lowest and
+    above the highest nothing lies."""
     twice = 2 * SCALES_PER_OCTAVE
     shifts = range(-LARGEST_TABLE_SHIFT, LARGEST_TABLE_SHIFT + 1)
-    return np.array([_root(1 << (twice * _EDGE_BITS + 2 * d - 1), twice) for d in shifts], np.int64)
+    edges = [_root(1 << (twice * _EDGE_BITS + 2 * d - 1), twice) for d in shifts]
+    return np.array([0, *edges[1:], 1 << 32], np.int64)
 
 
 def _root(x: int, degree: int) -> int:
@@ -159,17 +161,22 @@ def followed_tables(
 @njit(inline="always")
 def seen_after(seen, expected, known, table, symbol):
     """(seen, expected) after a symbol, given its table as the network gives it."""
-    place = min(known.first[table] + abs(np.int64(symbol)), known.first[table + 1] - 1)
-    return seen + known.seen[place], expected + known.expected[table]
+    at = np.uint64(table)
+    place = np.uint64(min(known.first[at] + abs(np.int64(symbol)), known.first[at + np.uint64(1)] - 1))
+    return seen + known.seen[place], expected + known.expected[at]
 
 
 @njit(inline="always")
 def shift_after(seen, expected, shift, edges):
     """The shift of tables, found from the one before it."""
     ratio = seen << _EDGE_BITS
-    while shift < LARGEST_TABLE_SHIFT and ratio >= expected * edges[shift + LARGEST_TABLE_SHIFT + 1]:
+    at = np.uint64(shift + LARGEST_TABLE_SHIFT)
+    # One step without a branch, as nobody can foretell it; further ones are rare.
+    up, down = ratio >= expected * edges[at + np.uint64(1)], ratio < expected * edges[at]
+    shift += np.int64(up) - np.int64(down)
+    while ratio >= expected * edges[np.uint64(shift + LARGEST_TABLE_SHIFT + 1)]:
         shift += 1
-    while shift > -LARGEST_TABLE_SHIFT and ratio < expected * edges[shift + LARGEST_TABLE_SHIFT]:
+    while ratio < expected * edges[np.uint64(shift + LARGEST_TABLE_SHIFT)]:
         shift -= 1
     return shift
 

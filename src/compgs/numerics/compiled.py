@@ -14,7 +14,8 @@ Python leave out:
 To hand over a share takes 20 microseconds: with `worth`, a function of the same arguments, a kernel says among how many
 threads a call is worth to be shared at most.
 
-Shares are contiguous. What stands before the loop is done by every thread. Arrays of one call must not overlap.
+Shares are contiguous. What stands before the loop is done by every thread. Arrays of one call must not overlap; of
+other kernels `apart=True` promises that.
 
 Any number of Python threads may call kernels at the same time. Processes are to be started with `spawn`: kernels run
 in forked ones, too, but torch's threads do not survive a fork.
@@ -61,8 +62,8 @@ class ParallelKernel(Kernel):
 
 
 class _WithoutOverlaps(compiler.Compiler):
-    """Compiles a function whose arrays do not overlap, which spares loops their checks, as numba does for bodies of
-    parallel loops."""
+    """Compiles a function whose arrays do not overlap, which spares loops their checks and loads, as numba does for
+    bodies of parallel loops."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -76,17 +77,23 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     if not isinstance(function, FunctionType) or "cache" in options:
         raise TypeError("expected a function, and numba's options but for cache")
     parallel, worth = options.pop("parallel", False), options.pop("worth", None)
+    compiled_by = _WithoutOverlaps if options.pop("apart", parallel) else compiler.Compiler
     if getattr(numba.config, "DISABLE_JIT", False):
         return (lambda *args: function(*args, ALL)) if parallel else function
     kernel: Any
     if parallel:
         options = {"nogil": True, "error_model": "numpy", **options}
-        kernel = ParallelKernel(function, targetoptions=_options(options), pipeline_class=_WithoutOverlaps)
+        kernel = ParallelKernel(function, targetoptions=_options(options), pipeline_class=compiled_by)
         kernel.worth = worth
     else:
-        kernel = Kernel(function, targetoptions=_options(options))
+        kernel = Kernel(function, targetoptions=_options(options), pipeline_class=compiled_by)
     kernel._cache = cache_of(function)
     return kernel
+
+
+def rows_a_thread(least: int) -> Callable[..., int]:
+    """For `worth`: among so many threads that each has `least` rows of the last argument or more."""
+    return lambda *arguments: len(arguments[-1]) // least
 
 
 def _options(options: dict[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import njit, portion, rows_a_thread
 
 # What a network takes of an anchor's neighbours, before what its means follow: known, activity.
 BESIDES = 2
@@ -94,7 +94,7 @@ def _enter(offsets, shift, table, factors):
         table[at] = j
 
 
-@njit(parallel=True)
+@njit(parallel=True, worth=rows_a_thread(512))
 def _look_around(offsets, holds_some, shift, table, factors, around, share):
     for j in portion(len(holds_some), share):
         if not holds_some[j]:
@@ -108,7 +108,7 @@ def _look_around(offsets, holds_some, shift, table, factors, around, share):
                     place += 1
 
 
-@njit(parallel=True)
+@njit(parallel=True, worth=rows_a_thread(512))
 def _look_up(offsets, known, shift, table, factors, node, share):
     for i in portion(len(node), share):
         a = known + i
