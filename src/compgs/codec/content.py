@@ -40,7 +40,7 @@ from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.head_weights import HeadDimensions, weight_shapes
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import njit, portion, rows_a_thread
 from compgs.ordering.neighbours import BESIDES, Neighbours, find_neighbours
 from compgs.ordering.order import level_counts, octree_depth, octree_origin
 from compgs.ordering.ranges import chosen_levels
@@ -314,11 +314,7 @@ def scatter_existing(existing: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [
     return slots
 
 
-def _additions_worth_sharing(steps: np.ndarray, means: np.ndarray) -> int:
-    return steps.size >> 17  # 30 microseconds
-
-
-@njit(parallel=True, worth=_additions_worth_sharing)
+@njit(parallel=True, worth=rows_a_thread(1 << 17))  # 30 microseconds
 def _add_steps(steps, means, share):
     for i in portion(len(steps), share):
         means[i] += steps[i] << FRACTION_BITS

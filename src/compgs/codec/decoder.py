@@ -76,7 +76,7 @@ def from_latents(content: FileContent, latents: Latents) -> HybridModel:
         values[name] = tensor.values.astype(np.float32) * np.float32(2.0**-tensor.exponent)
     anchor_index, slots = np.nonzero(content.mask)
     if SHARED_RESIDUALS in shapes:
-        residuals = values.pop(SHARED_RESIDUALS).take(slots, axis=0)  # a third of the time of `[slots]`
+        residuals = values.pop(SHARED_RESIDUALS).take(slots, axis=0)  # a twelfth of the time of `[slots]`
     else:
         residuals = _floats(d, latents, Role.RESIDUAL)
     log_scales = _floats(d, latents, Role.LOG_SCALES)

@@ -151,8 +151,8 @@ def _cell_state(filled: np.uint64, unknown: np.uint64, cell: Int) -> Int:
 # ---- the nodes of one level, found by place
 
 # What is at a place: 0 no node; otherwise a kind, with the occupancy of its children where that is known.
-_SINGLE, _CODED, _WAITING = 256, 512, 1024
 _WAITING_BIT = 10
+_SINGLE, _CODED, _WAITING = 256, 512, 1 << _WAITING_BIT
 
 
 class Level(NamedTuple):
@@ -233,7 +233,7 @@ def _look_around(
     filled = np.uint64(0)
     unknown = np.uint64(0)
     near: Int = 0
-    crowds: Int = 0
+    crowded: Int = 0
     # Without a branch: what is next to a node cannot be foretold, and each wrong guess would cost as much as all this.
     for j in range(27):
         where = _WHERE[node & 7, j]
@@ -241,9 +241,9 @@ def _look_around(
         filled |= _SPREAD[j, what & 255]
         unknown |= _SPREAD[j, 255 * ((what >> _WAITING_BIT) & 1)]
         near |= np.int64(what != 0) << j
-        crowds |= np.int64(what >= _CODED) << j
-    own = ~(1 << 13)
-    return filled, unknown, near & own, crowds & own
+        crowded |= np.int64(what >= _CODED) << j
+    others = ~(1 << 13)  # the node is no neighbour of itself
+    return filled, unknown, near & others, crowded & others
 
 
 # ---- single anchors

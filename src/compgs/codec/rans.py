@@ -10,8 +10,6 @@ depend on how many there are.
     last, words read forwards, and it must end in the initial states
 """
 
-from typing import Any
-
 import numpy as np
 
 from compgs.codec.fields import FieldReader, varint
@@ -27,7 +25,7 @@ from compgs.codec.rows import (
 )
 from compgs.codec.tables import LOOKUP_BITS, PRECISION_BITS, FrequencyTables
 from compgs.errors import CorruptSection
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import njit, portion, rows_a_thread
 
 CHUNK_SYMBOLS = 1 << 20
 SINGLE_STATE_SYMBOLS = (
@@ -232,12 +230,7 @@ def _encode_chunk(symbols, index, lowest, counts, offsets, cumulative, words):
     return position, escapes
 
 
-def _chunks(*arguments: Any) -> int:
-    """Of a call of the two kernels below."""
-    return len(arguments[-1])
-
-
-@njit(parallel=True, worth=_chunks)
+@njit(parallel=True, worth=rows_a_thread(1))
 def _encode_chunks(symbols, index, lowest, counts, offsets, cumulative, words, first, escapes, share):
     for c in portion(len(first), share):
         start = c * CHUNK_SYMBOLS
@@ -310,7 +303,7 @@ def _decode_chunk(words, begin, end, index, lowest, counts, offsets, cumulative,
     return escapes
 
 
-@njit(parallel=True, worth=_chunks)
+@njit(parallel=True, worth=rows_a_thread(1))
 def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, lookup, symbols, escapes, share):
     for c in portion(len(escapes), share):
         start = c * CHUNK_SYMBOLS
@@ -360,7 +353,7 @@ def _decode_rows_chunk(
     return escapes
 
 
-@njit(parallel=True, worth=_chunks)
+@njit(parallel=True, worth=rows_a_thread(1))
 def _decode_rows(
     words, ends, index, lowest, counts, offsets, cumulative, lookup, width, inertia, known, edges,
     symbols, escapes, share,
