@@ -124,11 +124,17 @@ def test_gradients_are_the_same_bits_with_one_thread_and_with_several():
 
 
 ROW, BYTES, SCRATCH = np.ones(8, np.float32), np.ones(8, np.uint8), np.ones(ssim_module._SCRATCH, np.float32)
+ROWS, ROWS_OF_BYTES, MAPS = (
+    np.ones((11, 8), np.float32),
+    np.ones((11, 8), np.uint8),
+    np.ones((11, 3, 8), np.float32),
+)
+WINDOW = np.arange(11, dtype=np.uint64), np.ones(11, np.float32)
 F = np.float32(0.5)
 KERNELS = {
-    "_add_products": (SCRATCH, 0, ROW, BYTES, F, F),
+    "_products": (SCRATCH, 0, ROWS, ROWS_OF_BYTES, F, *WINDOW, 0, 8),
     "_similarity": (SCRATCH, 8),
-    "_add_maps": (SCRATCH, 0, ROW, ROW, ROW, F),
+    "_summed_maps": (SCRATCH, 0, MAPS, *WINDOW, 0, 8),
     "_combine": (SCRATCH, ROW, BYTES, F, F, F, ROW),
 }
 
@@ -137,7 +143,8 @@ KERNELS = {
 def test_the_kernels_are_compiled_to_vector_instructions(name):
     """Losing them is silent otherwise, and costs a factor of five."""
     kernel = getattr(ssim_module, name)
-    fresh = numba.njit(kernel.py_func, **{k: v for k, v in kernel.targetoptions.items() if k != "nopython"})
+    options = {k: v for k, v in kernel.targetoptions.items() if k != "nopython"}
+    fresh = numba.njit(kernel.py_func, pipeline_class=kernel._compiler.pipeline_class, **options)
     fresh(*KERNELS[name])
     (code,) = fresh.inspect_llvm().values()
     assert re.search(r"fmul [a-z ]*<(4|8|16) x float>", code)

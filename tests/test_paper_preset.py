@@ -73,6 +73,7 @@ PUBLISHED = {
     "training.coarse_until": 0.0,
     "training.rate_every": 1,
     "training.sampled_gradients": 0.0,
+    "training.passed_over": 0.0,
     "training.averaged": 0.0,
 }
 

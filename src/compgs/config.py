@@ -214,6 +214,9 @@ class TrainingConfig:
     # as much larger, on the CPU; 0: all are; 1 is faster, and loses detail (not in the paper;
     # `tensors/gradient_sampling.py`)
     sampled_gradients: Annotated[float, Range(0, 100)] = 0.1
+    # of the mean gradient: anchors of a view whose primitives have less, as they stand behind others, are passed over
+    # until a step with the rate looks at them again; 0: none are (not in the paper; `training/hidden.py`)
+    passed_over: Share = 0.03
     # mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
     scale_weight: Annotated[float, Range(0, 1e6, below=True)] = 0.01
     # quantization steps per training step

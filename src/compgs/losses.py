@@ -29,6 +29,8 @@ from compgs.numerics.ssim import l1_and_ssim
 from compgs.tensors.ssim import ssim
 
 COMMON_EXTENT = 5.0  # world units
+# With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
+FEW_DRAWN = 0.1
 REVIVED = 0.05  # opacity, well above the rasterizer's cutoff
 
 

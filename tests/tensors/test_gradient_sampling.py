@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from compgs.gaussians import Gaussians
-from compgs.tensors.gradient_sampling import with_sampled_gradients
+from compgs.tensors.gradient_sampling import GradientSizes, with_sampled_gradients
 
 M = 400
 NAMES = ("means", "quaternions", "scales", "opacities", "colors")
@@ -91,3 +91,16 @@ def test_other_precisions_have_all_gradients():
         gradients(1.0, 0.5, sizes, torch.float64), gradients(0.0, 0.5, sizes, torch.float64), strict=True
     ):
         assert torch.equal(found, truth)
+
+
+def test_sizes_of_gradients_are_known_before_they_are_sampled():
+    given, weights = leaves(), uneven()
+    sizes = GradientSizes()
+    found = with_sampled_gradients(given, 0.5, lambda like: torch.zeros_like(like), sizes)
+    assert sizes.values is None
+    (weights * (3 * found.opacities + found.colors.sum(1)) + weights**2 * found.means.sum(1)).sum().backward()
+    scales = given.scales.detach().double()
+    shown = 6 * weights.double()
+    placed = weights.double() ** 2 * scales.sum(1)
+    expected = (shown / shown.mean() + placed / placed.mean()) / 2
+    torch.testing.assert_close(sizes.values.double(), expected, rtol=1e-5, atol=0)

@@ -62,20 +62,33 @@ def _across(S, i):
     return side + _G4 * (S[i + _u(12)] + S[i + _u(18)]) + _G5 * S[i + _u(15)]
 
 
-@njit(fastmath=_FASTMATH)
-def _add_products(S, at, x, y, scale, weight):
-    """Adds weight times (x, y, x x, y y, x y) to scratch rows 0 to 4, from element `at`."""
-    at = _u(at)
-    for i in range(_u(x.size)):
-        a = x[i]
-        b = _f(y[i]) * scale
-        wa, wb = weight * a, weight * b
+@njit
+def _find_rows(r, H, rows, weights):
+    """Fills in the rows [11] uint64 of the window around row `r` of `H`, and their weights [11] float32; beyond the
+    image some row of no weight.
+    """
+    for k in range(WINDOW_SIZE):
+        row = r + k - _RADIUS
+        inside = 0 <= row < H
+        rows[k] = row if inside else r
+        weights[k] = _TAPS[k] if inside else _ZERO
+
+
+@njit(fastmath=_FASTMATH, apart=True)
+def _products(S, at, x, y, scale, rows, weights, left, right):
+    """Weighted sums over rows [11] of x, y, x x, y y and x y, for columns from `left` to `right`: to scratch rows 0 to
+    4, from element `at`.
+    """
+    at, left = _u(at), _u(left)
+    for i in range(_u(right) - left):
+        c = left + i
+        m = n = xx = yy = xy = _ZERO
+        for k in range(WINDOW_SIZE):
+            a, b = x[rows[k], c], _f(y[rows[k], c]) * scale
+            wa, wb = weights[k] * a, weights[k] * b
+            m, n, xx, yy, xy = m + wa, n + wb, xx + wa * a, yy + wb * b, xy + wa * b
         o = at + i
-        S[o] += wa
-        S[o + _S1] += wb
-        S[o + _S2] += wa * a
-        S[o + _S3] += wb * b
-        S[o + _S4] += wa * b
+        S[o], S[o + _S1], S[o + _S2], S[o + _S3], S[o + _S4] = m, n, xx, yy, xy
 
 
 @njit(fastmath=_FASTMATH, error_model="numpy")
@@ -102,14 +115,20 @@ def _similarity(S, n, counts=None):
     return total
 
 
-@njit(fastmath=_FASTMATH)
-def _add_maps(S, at, d_m, d_xx, d_xy, weight):
-    at = _u(at)
-    for i in range(_u(d_m.size)):
+@njit(fastmath=_FASTMATH, apart=True)
+def _summed_maps(S, at, maps, rows, weights, left, right):
+    """Weighted sums over rows [11] of the three maps [H, 3, C]: to scratch rows 0 to 2, as `_products`."""
+    at, left = _u(at), _u(left)
+    for i in range(_u(right) - left):
+        c = left + i
+        m = xx = xy = _ZERO
+        for k in range(WINDOW_SIZE):
+            row, weight = rows[k], weights[k]
+            m += weight * maps[row, 0, c]
+            xx += weight * maps[row, 1, c]
+            xy += weight * maps[row, 2, c]
         o = at + i
-        S[o] += weight * d_m[i]
-        S[o + _S1] += weight * d_xx[i]
-        S[o + _S2] += weight * d_xy[i]
+        S[o], S[o + _S1], S[o + _S2] = m, xx, xy
 
 
 @njit(fastmath=_FASTMATH)
@@ -139,18 +158,16 @@ def _compare(x, y, scale, maps, sums, counts, share):
     counts [H, 3 W] float32: factors on SSIM at each element; None: one.
     """
     H, W = x.shape
+    S = np.empty(_SCRATCH, np.float32)
+    rows, weights = np.empty(WINDOW_SIZE, np.uint64), np.empty(WINDOW_SIZE, np.float32)
     for r in portion(H, share):
-        S = np.empty(_SCRATCH, np.float32)
+        _find_rows(r, H, rows, weights)
         similarity = 0.0
         for first in range(0, W, _TILE):
             last = min(W, first + _TILE)
             left, right = max(0, first - _HALO), min(W, last + _HALO)
             S[:] = _ZERO
-            for k in range(WINDOW_SIZE):
-                row = r + k - _RADIUS
-                if 0 <= row < H:
-                    at = left - (first - _HALO)
-                    _add_products(S, at, x[row, left:right], y[row, left:right], scale, _TAPS[k])
+            _products(S, left - (first - _HALO), x, y, scale, rows, weights, left, right)
             if counts is None:
                 similarity += _similarity(S, last - first)
             else:
@@ -165,18 +182,15 @@ def _compare(x, y, scale, maps, sums, counts, share):
 def _compare_gradient(x, y, scale, maps, ssim_factor, l1_factor, d_x, share):
     """d_x [H, 3 W] = ssim_factor * dSSIM/dx + l1_factor * sign(x - y)."""
     H, W = x.shape
+    S = np.empty(_SCRATCH, np.float32)
+    rows, weights = np.empty(WINDOW_SIZE, np.uint64), np.empty(WINDOW_SIZE, np.float32)
     for r in portion(H, share):
-        S = np.empty(_SCRATCH, np.float32)
+        _find_rows(r, H, rows, weights)
         for first in range(0, W, _TILE):
             last = min(W, first + _TILE)
             left, right = max(0, first - _HALO), min(W, last + _HALO)
             S[:] = _ZERO
-            for k in range(WINDOW_SIZE):
-                row = r + k - _RADIUS
-                if 0 <= row < H:
-                    at = left - (first - _HALO)
-                    m = maps[row]
-                    _add_maps(S, at, m[0, left:right], m[1, left:right], m[2, left:right], _TAPS[k])
+            _summed_maps(S, left - (first - _HALO), maps, rows, weights, left, right)
             y_row, d_row = y[r, first:last], d_x[r, first:last]
             _combine(S, x[r, first:last], y_row, scale, ssim_factor, l1_factor, d_row)
 

@@ -31,6 +31,9 @@ class StepProfile:
         self.steps = 0
         self._seen = 0
         self._last = 0.0
+        self._inside = (
+            False  # one of the watched methods, whose part is all that it calls: pruning looks at views, too
+        )
 
     def watch(self, trainer: Any, parts: Mapping[str, str], stations: Stations) -> None:
         """Wrap a trainer's methods: `parts` names what each of them is; `train_step` is the whole, `backward` the
@@ -63,7 +66,13 @@ class StepProfile:
     def _timed(self, method: Callable[..., Any], part: str) -> Callable[..., Any]:
         @functools.wraps(method)
         def timed(*arguments: Any, **named: Any) -> Any:
-            result = method(*arguments, **named)
+            if self._inside:
+                return method(*arguments, **named)
+            self._inside = True
+            try:
+                result = method(*arguments, **named)
+            finally:
+                self._inside = False
             self._lap(part)
             return result
 

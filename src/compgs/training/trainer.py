@@ -16,6 +16,7 @@ from compgs.entropy.quantization import UniformNoise
 from compgs.errors import TrainingError
 from compgs.gaussians import Gaussians
 from compgs.losses import (
+    FEW_DRAWN,
     Target,
     photometric_loss,
     rate,
@@ -29,7 +30,7 @@ from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
-from compgs.tensors.gradient_sampling import with_sampled_gradients
+from compgs.tensors.gradient_sampling import GradientSizes, with_sampled_gradients
 from compgs.tensors.prediction import (
     Geometry,
     Prediction,
@@ -67,6 +68,7 @@ from compgs.training.dropout import thinned
 from compgs.training.events import Event, at_shares
 from compgs.training.few_views import fewness
 from compgs.training.file_size import anchor_bits, fixed_bytes
+from compgs.training.hidden import HiddenAnchors
 from compgs.training.importance import LOOKED_AT, missed, spread, view_contributions, views_to_prune_by
 from compgs.training.initial import initial_model
 from compgs.training.loop import (
@@ -91,8 +93,6 @@ from compgs.training.target_size import TargetSize
 from compgs.training.views_in_turn import ViewsInTurn
 
 METHOD = "compgs"
-# With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
-FEW_DRAWN = 0.1
 
 
 def train(
@@ -152,7 +152,8 @@ class Trainer:
         self.average = Averaging(self.model)
         self.schedule = make_schedule(config.control, t.steps, views, per_step)
         self.bounds = AnchorBounds(self.model, self.geometry)
-        self.control = AdaptiveControl(config, self.schedule, self.shape, device)
+        self.hidden = HiddenAnchors(t, views, self.shape, device)
+        self.control = AdaptiveControl(config, self.schedule, self.shape, device, (self.hidden.replaced,))
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
         self.noise = UniformNoise(t.seed + 3, self.views.chance, device)
         self.reference_rates: Tensor | None = None  # [reference_dim], once the channels differ in it
@@ -188,9 +189,14 @@ class Trainer:
         return replace(result, loss=loss / len(looks.views))
 
     def look(self) -> StepViews:
-        """The views of this step, and the anchors that they may show."""
+        """The views of this step, and the anchors that they may show; between steps with the rate, which is of all
+        of these, those that they showed before.
+        """
         views = self.views.next()
         rows = [self.visible_anchors(self.scene.train_views[view].camera) for view in views]
+        t = self.config.training
+        if self.progress >= t.rate_start and self.step % t.rate_every:
+            rows = [self.hidden.others(view, of_view) for view, of_view in zip(views, rows, strict=True)]
         return step_views(views, rows, self.model.anchors, self.noise)
 
     def learn(self, looks: StepViews) -> StepResult:
@@ -239,13 +245,15 @@ class Trainer:
         rows = looks.own.rows_of(number)
         if geometry is not None:
             geometry = geometry.of(None if part is None else self.model.slots(part))
+        sizes = GradientSizes()
         prediction, gaussians = self.predict_some(
-            shown.of(part), rows, camera, looks.noise_of_view(number), geometry
+            shown.of(part), rows, camera, looks.noise_of_view(number), geometry, sizes
         )
         rendered = self.rasterize(gaussians, camera)
         loss = self.compare(rendered, photograph) + self.regularize(prediction, gaussians, camera)
         self.backward(loss, rendered, gaussians)
         self.observe(rows, prediction, rendered, camera)
+        self.hidden.observe(view, rows, prediction, gaussians, sizes)
         return StepResult(loss.detach(), rendered.image.detach(), photograph)
 
     @property
@@ -282,13 +290,21 @@ class Trainer:
         return self.progress >= self.config.training.quantized_weights
 
     def predict_some(
-        self, latents: Quantized, rows: Tensor, camera: Camera, noise: Noise, geometry: Geometry | None
+        self,
+        latents: Quantized,
+        rows: Tensor,
+        camera: Camera,
+        noise: Noise,
+        geometry: Geometry | None,
+        sizes: GradientSizes,
     ) -> tuple[Prediction, Gaussians]:
-        """What the view may show (Sec. 3.2), and its Gaussians without those that chance leaves out of this step."""
+        """What the view may show (Sec. 3.2), and its Gaussians without those that chance leaves out of this step.
+        `sizes` will be those of their gradients.
+        """
         prediction = self.predict(latents, rows, camera, self.stored, geometry)
         gaussians = thinned(prediction, self.left_out, noise)
         share = self.config.training.sampled_gradients
-        return prediction, with_sampled_gradients(gaussians, share, noise)
+        return prediction, with_sampled_gradients(gaussians, share, noise, sizes)
 
     def predict(
         self,
@@ -546,7 +562,7 @@ class Trainer:
     def write(self, path: Path, writer: Writer | None) -> None:
         extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
         extra["chance"] = self.chance.get_state()
-        extra |= self.views.tensors() | self.average.tensors()
+        extra |= self.views.tensors() | self.average.tensors() | self.hidden.tensors()
         if self.reference_rates is not None:
             extra["reference_rates"] = self.reference_rates
         if self.bounds.measured is not None:
@@ -579,6 +595,7 @@ class Trainer:
                 bounds = checkpoint.extra["bounds"]
                 check_tensor(bounds, (trainer.model.anchors,), torch.float32, "bounds")
                 trainer.bounds.measured = bounds.to(device)
+            trainer.hidden.restore(checkpoint.extra)
             restore_chance(trainer.chance, checkpoint.extra)
             trainer.views.restore(checkpoint.state, checkpoint.extra)
             trainer.average.restore(checkpoint.state["averaged"], checkpoint.extra)

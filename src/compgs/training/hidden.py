@@ -1,0 +1,105 @@
+"""Anchors that a view does not show, though they are in its frustum: they stand behind others.
+
+A third of the anchors in view hardly show, and cost as much as the others until their gradients turn out to be nothing.
+Each view remembers which they were; its next steps pass them over. In every `training.rate_every`-th step, the one that
+counts the bits of all anchors in view, all are looked at again: on average at every fourth visit of a view
+(docs/log/2026-11-25-29-hidden.md). Before there is a rate, much is hidden now and seen soon: then all are looked at.
+
+What counts is not the gradient by an anchor's latents, of which a sample is left, but those by its primitives
+(`tensors/gradient_sampling.py`). Something that shows always has some: L1 pulls at every value by as much, however
+small the error is.
+"""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from compgs.config import TrainingConfig
+from compgs.gaussians import Gaussians
+from compgs.losses import FEW_DRAWN
+from compgs.numerics.compiled import njit
+from compgs.tensors.gradient_sampling import GradientSizes
+from compgs.tensors.prediction import Prediction, runs_in_kernels
+from compgs.training.distributed import world
+from compgs.training.restoring import check_tensor
+
+
+class HiddenAnchors:
+    """Of each training view, the anchors that hardly showed when it last looked at them."""
+
+    def __init__(
+        self, config: TrainingConfig, views: int, shape: tuple[int, int], device: torch.device
+    ) -> None:
+        """`shape`: N, K. Nothing is hidden where gradients are not sampled, nor with several ranks: these must look at
+        the same anchors, and each would know of its own views alone.
+        """
+        known = config.sampled_gradients > 0.0 and runs_in_kernels(device) and world() == 1
+        self.share = config.passed_over if known else 0.0
+        anchors, self.coupled_primitives = shape
+        remembered = views if self.share > 0.0 else 0
+        self.hidden = torch.zeros(anchors, remembered, dtype=torch.bool, device=device)
+
+    def others(self, view: int, rows: Tensor) -> Tensor:
+        """Of the anchors `rows` [V] int64 those that are not hidden in a view."""
+        return rows if self.share <= 0.0 else rows[~self.hidden[rows, view]]
+
+    def observe(
+        self, view: int, rows: Tensor, prediction: Prediction, gaussians: Gaussians, sizes: GradientSizes
+    ) -> None:
+        """After the backward pass of a view: its anchors [V], their prediction, the Gaussians that were drawn of it (of
+        opacity 0: left out by chance), and how large their gradients were.
+        """
+        if self.share <= 0.0 or sizes.values is None:
+            return
+        found = torch.zeros(len(rows), dtype=torch.bool)
+        # Where hardly anything is drawn, nothing is hidden by others: the scene vanishes, and is to come back.
+        if len(prediction.index) >= FEW_DRAWN * len(prediction.opacities):
+            _find_hidden(
+                prediction.index.numpy(),
+                gaussians.opacities.detach().numpy(),
+                sizes.values.numpy(),
+                self.coupled_primitives,
+                self.share,
+                found.numpy(),
+            )
+        self.hidden[rows, view] = found
+
+    def replaced(self, kept: Tensor, new: int) -> None:
+        """Only the anchors `kept` [N] bool are left, and so many new ones follow."""
+        views = self.hidden.shape[1]
+        self.hidden = torch.cat([self.hidden[kept], self.hidden.new_zeros(new, views)])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """For a checkpoint."""
+        return {"hidden": self.hidden}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """From a checkpoint; what one rank remembered is of no use to several, which remember nothing, nor the other
+        way round. Raises ValueError, KeyError, IndexError for a damaged one.
+        """
+        hidden = tensors["hidden"]
+        anchors, views = self.hidden.shape
+        if 0 in (views, hidden.shape[-1]):
+            check_tensor(hidden[:, :0], (anchors, 0), torch.bool, "hidden")
+            return
+        check_tensor(hidden, (anchors, views), torch.bool, "hidden")
+        self.hidden = hidden.to(self.hidden.device)
+
+
+@njit
+def _find_hidden(index, opacities, sizes, k, share, hidden):
+    """hidden [V]: whether the mean of an anchor's gradient sizes, of K primitives, is below `share`. Those that are not
+    drawn, which `index` [M] lacks, have none; of those that were left out it is not known.
+    """
+    m = 0
+    for anchor in range(len(hidden)):
+        total, known = 0.0, k
+        while m < len(index) and index[m] < (anchor + 1) * k:
+            if opacities[m] > 0:
+                total += sizes[m]
+            else:
+                known -= 1
+            m += 1
+        # NaN, as of a run that has diverged, hides nothing
+        hidden[anchor] = known > 0 and total < share * known
