@@ -81,6 +81,10 @@ def test_where_hardly_anything_is_drawn_nothing_is_hidden():
     rows, sizes = list(range(6)), [1.0, 1.0]
     assert observed(hidden, rows, [0, 1], [0.5, 0.5], sizes) == [0]  # a sixth of all
     assert observed(hidden, rows, [0], [0.5], sizes[:1]) == rows  # a twelfth
+    assert observed(hidden, rows, [0, 1], [0.5, 0.5], sizes) == [0]
+    nothing = SimpleNamespace(index=torch.tensor([], dtype=torch.int64), opacities=torch.zeros(K * 6))
+    hidden.observe(1, torch.arange(6), nothing, SimpleNamespace(opacities=torch.zeros(0)), GradientSizes())
+    assert hidden.others(1, torch.arange(6)).tolist() == rows
 
 
 def test_what_one_rank_remembers_comes_back_and_is_of_no_use_to_several():

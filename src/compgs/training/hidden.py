@@ -50,11 +50,11 @@ class HiddenAnchors:
         """After the backward pass of a view: its anchors [V], their prediction, the Gaussians that were drawn of it (of
         opacity 0: left out by chance), and how large their gradients were.
         """
-        if self.share <= 0.0 or sizes.values is None:
+        if self.share <= 0.0:
             return
         found = torch.zeros(len(rows), dtype=torch.bool)
         # Where hardly anything is drawn, nothing is hidden by others: the scene vanishes, and is to come back.
-        if len(prediction.index) >= FEW_DRAWN * len(prediction.opacities):
+        if sizes.values is not None and len(prediction.index) >= FEW_DRAWN * len(prediction.opacities):
             _find_hidden(
                 prediction.index.numpy(),
                 gaussians.opacities.detach().numpy(),
