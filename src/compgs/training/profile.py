@@ -31,9 +31,8 @@ class StepProfile:
         self.steps = 0
         self._seen = 0
         self._last = 0.0
-        self._inside = (
-            False  # one of the watched methods, whose part is all that it calls: pruning looks at views, too
-        )
+        # One of the watched methods, whose part is all that it calls: pruning looks at views, too.
+        self._inside = False
 
     def watch(self, trainer: Any, parts: Mapping[str, str], stations: Stations) -> None:
         """Wrap a trainer's methods: `parts` names what each of them is; `train_step` is the whole, `backward` the

@@ -189,8 +189,8 @@ class Trainer:
         return replace(result, loss=loss / len(looks.views))
 
     def look(self) -> StepViews:
-        """The views of this step, and the anchors that they may show; between steps with the rate, which is of all
-        of these, those that they showed before.
+        """The views of this step, and the anchors that they may show. The rate is of all of these; steps without it
+        pass over those that were hidden.
         """
         views = self.views.next()
         rows = [self.visible_anchors(self.scene.train_views[view].camera) for view in views]
