@@ -88,8 +88,8 @@ class ModelConfig:
     # the paper; training pays for each by itself)
     row_context: bool = True
     # networks are narrower, their weights of fewer bits, than `width` and `head_bits` say, and there is no such
-    # context, where networks would be a sixth of the file and more: a large lambda and few anchors, or a small file
-    # that is asked for (not in the paper)
+    # context, where networks would be much of the file: a large lambda and few anchors, or a small file that is asked
+    # for (not in the paper)
     networks_by_price: bool = True
     # separate: four networks (Sec. 3.2); paired: geometry, appearance
     heads: Literal["separate", "paired"] = "paired"
@@ -178,9 +178,9 @@ class ControlConfig:
     prune_at: Shares = (0.3, 0.5, 0.6, 0.7)
     # what a mean squared change of the training views costs, in units of the loss, as pruning reckons
     # (`training/pruning.py`)
-    prune_worth: Annotated[float, Range(0, 1e9, above=True, below=True)] = 20.0
+    prune_worth: Annotated[float, Range(0, 1e9, above=True, below=True)] = 40.0
     # by which a bit is cheaper to it where training views are few: what adds little may be all that one view has
-    prune_less: Share = 0.75
+    prune_less: Share = 0.5
 
 
 @dataclass(frozen=True)

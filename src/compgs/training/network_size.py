@@ -2,42 +2,50 @@
 
 A bit of the networks adds lambda * RATE_PER_BIT / N to the objective (`losses.rate`), as N anchors share it. With a
 large lambda and few anchors the networks would be a third to a half of the file: there fewer hidden units and coarser
-weights cost less than they save. Where anchors are many, or bits cheap, nothing changes.
+weights cost less than they save. Half of the units take a sixth less of a step, too, so that they pay long before that.
+Where anchors are many, or bits cheap, nothing changes.
 """
 
+from dataclasses import dataclass
 from typing import Literal
 
 from compgs.config import Config
 from compgs.training.own_residuals import CHEAP_BYTES, Limits, often_seen
 
-# Hidden units from a price of a bit on, lambda / N as the run starts (docs/log/2026-11-23-14-pruning.md).
-WIDTHS = ((6e-7, 24), (1e-6, 16), (1.5e-6, 8))
-# And up to a size of the file, where one is asked for.
-WIDTHS_OF_SIZES = ((26_000, 24), (18_000, 16), (9_000, 8))
+
+@dataclass(frozen=True)
+class Dear:
+    """From where on bits are dear."""
+
+    price: float  # lambda / N as the run starts, at least
+    size: int  # bytes of the file at most, where a size is asked for: it decides then
+
+    def met(self, config: Config, anchors: int) -> bool:
+        """Whether they are in a run that starts with so many anchors."""
+        t = config.training
+        if not config.model.networks_by_price:
+            return False
+        if t.target_bytes is not None:
+            return t.target_bytes <= self.size
+        return t.lmbda >= self.price * anchors
+
+
+# Hidden units (docs/log/2026-11-25-30-width.md).
+WIDTHS = ((Dear(1e-7, 50_000), 16), (Dear(1.5e-6, 9_000), 8))
+# In so small a file a context hardly saves what its network costs (docs/log/2026-11-24-21-context.md).
+NO_CONTEXT = Dear(6e-7, 26_000)
 # Bits by which weights are shorter, from a price on, lambda / N of the anchors that there are in the end.
 SHORTER = ((3e-6, 1), (3e-5, 2))
 
 
 def hidden_width(config: Config, anchors: int) -> int:
     """Hidden units of the networks of a run that starts with so many anchors; at most `model.width`."""
-    return min([config.model.width, *_narrower(config, anchors)])
+    return min([config.model.width, *(width for dear, width in WIDTHS if dear.met(config, anchors))])
 
 
 def reference_context(config: Config, anchors: int) -> Literal["neighbours", "hyperprior", "none"]:
-    """Of a run that starts with so many anchors: none where networks are narrower. In so small a file a context hardly
-    saves what its network costs.
-    """
-    return "none" if _narrower(config, anchors) else config.model.reference_context
-
-
-def _narrower(config: Config, anchors: int) -> list[int]:
-    """Hidden units that the price of a bit, or the size that is asked for, leaves to the networks."""
-    t = config.training
-    if not config.model.networks_by_price:
-        return []
-    if t.target_bytes is not None:
-        return [width for size, width in WIDTHS_OF_SIZES if t.target_bytes <= size]
-    return [width for price, width in WIDTHS if t.lmbda >= price * anchors]
+    """Of a run that starts with so many anchors."""
+    return "none" if NO_CONTEXT.met(config, anchors) else config.model.reference_context
 
 
 def head_bits(config: Config, lmbda: float, anchors: int) -> int:
