@@ -2,8 +2,8 @@
 
 A bit of the networks adds lambda * RATE_PER_BIT / N to the objective (`losses.rate`), as N anchors share it. With a
 large lambda and few anchors the networks would be a third to a half of the file: there fewer hidden units and coarser
-weights cost less than they save. Half of the units take a sixth less of a step, too, so that they pay long before that.
-Where anchors are many, or bits cheap, nothing changes.
+weights cost less than they save. With half of the units a step takes a tenth to a sixth less, too: they pay long before
+that. Where anchors are many, or bits cheap, nothing changes.
 """
 
 from dataclasses import dataclass
