@@ -30,8 +30,9 @@ class Dear:
         return t.lmbda >= self.price * anchors
 
 
-# Hidden units (docs/log/2026-11-25-30-width.md).
-WIDTHS = ((Dear(1e-7, 50_000), 16), (Dear(1.5e-6, 9_000), 8))
+# Hidden units. Fox with lambda 0.001 (a price of 1.2e-7) is better with 32, plush (1.6e-7) with 16
+# (docs/log/2026-11-25-31-figures.md).
+WIDTHS = ((Dear(1.4e-7, 50_000), 16), (Dear(1.5e-6, 9_000), 8))
 # In so small a file a context hardly saves what its network costs (docs/log/2026-11-24-21-context.md).
 NO_CONTEXT = Dear(6e-7, 26_000)
 # Bits by which weights are shorter, from a price on, lambda / N of the anchors that there are in the end.
