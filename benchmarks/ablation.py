@@ -259,6 +259,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("-r", "--downscale", type=int, default=1)
     parser.add_argument("--threads", type=int)
     parser.add_argument("--lpips", action="store_true")
+    parser.add_argument("--flip", action="store_true")
     parser.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="of all variants"
     )
@@ -271,7 +272,11 @@ def common_arguments(options: argparse.Namespace) -> list[str]:
     result = ["-r", str(options.downscale)]
     for name, value in given.items():
         result += [name, str(value)] if value is not None else []
-    return [*result, *_set(*options.set), *(["--lpips"] if options.lpips else [])]
+    return [
+        *result,
+        *_set(*options.set),
+        *(f"--{name}" for name in ("lpips", "flip") if getattr(options, name)),
+    ]
 
 
 def main(arguments: Sequence[str] | None = None, run: Callable[[list[str]], None] = run_compgs) -> None:

@@ -4,7 +4,7 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-from ablation_tables import Row, bits_each, curves_of
+from ablation_tables import Row, bits_each, curves_of, measured
 
 SIZE = (6.4, 4.0)  # inches
 SMALLEST_SHARE = 0.01  # of a file: components below it are drawn together
@@ -29,12 +29,17 @@ def figure(name: str, scene: str, rows: Sequence[Row]) -> bytes:
         canvas, (left, right) = pyplot.subplots(1, 2, figsize=(1.7 * SIZE[0], SIZE[1]), width_ratios=(2, 1))
         draw_components(left, rows)
         draw_bits(right, rows)
+    elif name == "curve":
+        measures = list(measured(rows))
+        size = (len(measures) * 0.8 * SIZE[0], SIZE[1])
+        canvas, panels = pyplot.subplots(1, len(measures), figsize=size)
+        for axes, measure in zip(panels, measures, strict=True):
+            draw_curves(axes, rows, measure)
+            label_axes(axes, measure)
     else:
         canvas, axes = pyplot.subplots(figsize=SIZE)
-        draw_curves(axes, rows) if name == "curve" else draw_points(axes, rows)
-        axes.set_xlabel("file, kB")
-        axes.set_ylabel("PSNR of held-out views, dB")
-        axes.grid(alpha=0.3)
+        draw_points(axes, rows)
+        label_axes(axes, "psnr")
     canvas.suptitle(f"{name}: {scene}", fontsize=11)
     return png(canvas)
 
@@ -71,9 +76,16 @@ def draw_points(axes: Any, rows: Sequence[Row]) -> None:
     axes.legend(fontsize=8)
 
 
-def draw_curves(axes: Any, rows: Sequence[Row]) -> None:
+def label_axes(axes: Any, measure: str) -> None:
+    """Of a chart of quality over size."""
+    axes.set_xlabel("file, kB")
+    axes.set_ylabel(f"{measure.upper()} of held-out views{', dB' if measure == 'psnr' else ''}")
+    axes.grid(alpha=0.3)
+
+
+def draw_curves(axes: Any, rows: Sequence[Row], measure: str) -> None:
     """A line a curve, over the logarithm of the size."""
-    for name, points in curves_of(rows).items():
+    for name, points in curves_of(rows, measure).items():
         sizes, quality = zip(*sorted(points), strict=True)
         axes.plot([size / 1e3 for size in sizes], quality, marker="o", label=name)
     logarithmic_sizes(axes)

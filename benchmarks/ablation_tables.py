@@ -1,6 +1,5 @@
 """Tables of the ablations: variants over seeds, components, curves."""
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
@@ -26,6 +25,7 @@ class Row:
     psnr_spread: float | None
     ssim: float
     lpips: float | None
+    flip: float | None
     bytes: float | None  # None: no file holds it
     anchors: float | None
     primitives: float | None  # coupled primitives, or splats of 3DGS
@@ -42,9 +42,7 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
             psnr = [record["unrounded"]["psnr"] for record in mine]
             ssim = fmean(record["unrounded"]["ssim"] for record in mine)
             label = "trained unrounded, never rounded (no file)"
-            rows.append(
-                Row(label, "", fmean(psnr), _spread(psnr), ssim, None, None, None, None, _seconds(mine), {})
-            )
+            rows.append(Row(label, "", fmean(psnr), _spread(psnr), ssim, *[None] * 5, _seconds(mine), {}))
         results = [record["results"] for record in mine]
         psnr = [result["psnr"] for result in results]
         components = list(dict.fromkeys(name for result in results for name in result["components"]))
@@ -56,6 +54,7 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
                 psnr_spread=_spread(psnr),
                 ssim=_mean(results, "ssim"),
                 lpips=_mean_or_none(results, "lpips"),
+                flip=_mean_or_none(results, "flip"),
                 bytes=_mean(results, "bytes"),
                 anchors=_mean_or_none(results, "anchors"),
                 primitives=_mean_or_none(results, "splats") or _mean_or_none(results, "coupled_primitives"),
@@ -107,12 +106,12 @@ def paired_differences(records: Sequence[Record]) -> list[str]:
 
 def table(rows: Sequence[Row]) -> str:
     """Markdown."""
-    with_lpips = any(row.lpips is not None for row in rows)
+    more = [name for name in ("lpips", "flip") if any(getattr(row, name) is not None for row in rows)]
     head = [
         "",
         "PSNR (dB)",
         "SSIM",
-        *(["LPIPS"] if with_lpips else []),
+        *map(str.upper, more),
         "bytes",
         "anchors",
         "primitives",
@@ -121,9 +120,10 @@ def table(rows: Sequence[Row]) -> str:
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row in rows:
         spread = f" ± {row.psnr_spread:.2f}" if row.psnr_spread is not None else ""
-        lpips = [] if not with_lpips else ["" if row.lpips is None else f"{row.lpips:.3f}"]
+        others = [getattr(row, name) for name in more]
         counts = [row.bytes, row.anchors, row.primitives]
-        cells = [row.label, f"{row.psnr:.2f}{spread}", f"{row.ssim:.4f}", *lpips]
+        cells = [row.label, f"{row.psnr:.2f}{spread}", f"{row.ssim:.4f}"]
+        cells += ["" if value is None else f"{value:.4f}" for value in others]
         cells += ["none" if c is None else f"{c:,.0f}" for c in counts]
         lines.append("| " + " | ".join([*cells, f"{row.seconds:.0f}"]) + " |")
     return "\n".join(lines)
@@ -149,33 +149,43 @@ def bits_each(row: Row) -> tuple[float, float]:
     return anchor / max(row.anchors or 0, 1), coupled / max(row.primitives or 0, 1)
 
 
-def curves_of(rows: Sequence[Row]) -> dict[str, list[tuple[float, float]]]:
-    """(bytes, PSNR) of each curve."""
+def measured(rows: Sequence[Row]) -> dict[str, int]:
+    """Measures that all points of curves know: PSNR, SSIM, FLIP; -1: less is better."""
+    known = {"psnr": 1, "ssim": 1, "flip": -1}
+    return {m: sign for m, sign in known.items() if all(getattr(r, m) is not None for r in rows if r.curve)}
+
+
+def curves_of(rows: Sequence[Row], measure: str) -> dict[str, list[tuple[float, float]]]:
+    """(bytes, quality) of each curve."""
     return {
-        curve: [(row.bytes, row.psnr) for row in rows if row.curve == curve and row.bytes is not None]
+        curve: [(row.bytes, getattr(row, measure)) for row in rows if row.curve == curve and row.bytes]
         for curve in dict.fromkeys(row.curve for row in rows if row.curve)
     }
 
 
 def compare_curves(rows: Sequence[Row]) -> list[str]:
-    """BD-rate of every curve against the first, and which curves are not monotone."""
-    curves = curves_of(rows)
-    first, *others = curves
+    """BD-rates of every curve against the first, and on which curves more bytes are not always better."""
     lines = []
-    for name, curve in curves.items():
-        ordered = sorted(curve)
-        monotone = all(a[1] < b[1] for a, b in itertools.pairwise(ordered))
-        lines.append(f"{name}: PSNR {'rises' if monotone else 'does not always rise'} with the bytes")
-    for name in others:
-        lines.append(f"BD-rate of {name} against {first}: {described(curves[first], curves[name])}")
-        fronts = front(curves[first]), front(curves[name])
-        if fronts != (sorted(curves[first]), sorted(curves[name])):
-            kept = (
-                f"{len(fronts[0])} of {len(curves[first])} and {len(fronts[1])} of {len(curves[name])} points"
-            )
+    for measure, sign in measured(rows).items():
+        title = measure.upper()
+        curves = {
+            name: [(size, sign * quality) for size, quality in curve]
+            for name, curve in curves_of(rows, measure).items()
+        }
+        first, *others = curves
+        for name, curve in curves.items():
+            if front(curve) != sorted(curve):
+                lines.append(f"{name}: {title} is not always better with more bytes")
+        for name in others:
             lines.append(
-                f"the same without points that a smaller file of the curve beats ({kept}): {described(*fronts)}"
+                f"BD-rate of {name} against {first} by {title}: {described(curves[first], curves[name])}"
             )
+            fronts = front(curves[first]), front(curves[name])
+            if fronts != (sorted(curves[first]), sorted(curves[name])):
+                kept = f"{len(fronts[0])} of {len(curves[first])} and {len(fronts[1])} of {len(curves[name])} points"
+                lines.append(
+                    f"the same without points that a smaller file of the curve beats ({kept}): {described(*fronts)}"
+                )
     return lines
 
 

@@ -74,7 +74,9 @@ def run_phase(phase: str, folder: Path, command: Sequence[str]) -> dict[str, Any
 
 def train_command(method: Method, scene: Path, folder: Path, options: argparse.Namespace) -> list[str]:
     """The run as `compgs train` would be asked for it."""
-    shared = common_arguments(argparse.Namespace(**vars(options), preset=None, set=[], lpips=False))
+    shared = common_arguments(
+        argparse.Namespace(**vars(options), preset=None, set=[], lpips=False, flip=False)
+    )
     device = ["--device", options.device] if options.device else []
     seed = ["--seed", str(options.seed)]
     return ["train", str(scene), "-o", str(folder), *shared, *method.arguments, *seed, *device]

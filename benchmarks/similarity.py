@@ -75,7 +75,7 @@ def trained_splats(options: argparse.Namespace) -> Path:
     scene = options.source.resolve()
     folder = options.runs / "similarity" / f"{scene.name}_3dgs_seed{options.seed}"
     # What all variants of an ablation share, with nothing set and nothing else evaluated.
-    common = common_arguments(argparse.Namespace(**vars(options), set=[], lpips=False))
+    common = common_arguments(argparse.Namespace(**vars(options), set=[], lpips=False, flip=False))
     command = train_command(PLAIN_3DGS, scene, folder, common, options.seed)
     record = run_variant(PLAIN_3DGS, command, folder, options.seed, run_compgs)
     # A training of the same settings may lie in another study's folder.

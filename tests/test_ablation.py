@@ -150,8 +150,9 @@ def test_the_report_says_what_the_runs_said(tmp_path: Path) -> None:
 
 def test_curves_are_compared_by_bd_rate(tmp_path: Path) -> None:
     text = study(tmp_path, Trainings(), "curve")
-    assert "paper: PSNR rises with the bytes" in text
-    assert "BD-rate of default against paper: -" in text
+    assert "BD-rate of default against paper by PSNR: -" in text
+    assert "PSNR is not always" not in text and "paper: SSIM is not always better with more bytes" in text
+    assert "FLIP" not in text
 
 
 def test_spreads_and_paired_differences_are_over_seeds() -> None:

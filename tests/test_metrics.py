@@ -65,7 +65,7 @@ def test_renderings_are_rounded_and_clamped_not_truncated():
     "other", [PHOTOGRAPH[:, :49], PHOTOGRAPH / 255.0, PHOTOGRAPH[..., 0]], ids=["size", "floats", "gray"]
 )
 def test_images_that_cannot_be_compared_are_refused(other):
-    for metric in (metrics.psnr, metrics.ssim, metrics.lpips):
+    for metric in (metrics.psnr, metrics.ssim, metrics.lpips, metrics.flip):
         with pytest.raises(ValueError, match=r"\[H, W, 3\]|size"):
             metric(PHOTOGRAPH, other)
 
@@ -118,6 +118,67 @@ def test_lpips_without_weights_says_which_file_is_missing_and_downloads_nothing(
     with pytest.raises(metrics.Unavailable, match=r"alexnet.*missing"):
         metrics.lpips(PHOTOGRAPH, PHOTOGRAPH, "alex")
     assert list(tmp_path.iterdir()) == []
+
+
+def hunt_adjusted_lab(color: tuple[int, int, int]) -> np.ndarray:
+    """L*, a* and b* (D65) of an 8-bit color, chroma by lightness, as FLIP compares them (Andersson et al. 2020)."""
+    srgb = np.array(color) / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    matrix = np.array(
+        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]], np.float64
+    )
+    x, y, z = (matrix @ linear) / matrix.sum(1)
+    fx, fy, fz = (t ** (1 / 3) if t > (6 / 29) ** 3 else t / (3 * (6 / 29) ** 2) + 4 / 29 for t in (x, y, z))
+    light = 116 * fy - 16
+    return np.array([light, 0.01 * light * 500 * (fx - fy), 0.01 * light * 200 * (fy - fz)])
+
+
+def flip_of_colors(a: tuple[int, int, int], b: tuple[int, int, int]) -> float:
+    """FLIP of two images of one color each, in which nothing has an edge, in closed form."""
+
+    def distance(a, b):
+        d = hunt_adjusted_lab(a) - hunt_adjusted_lab(b)
+        return (abs(d[0]) + np.hypot(d[1], d[2])) ** 0.7
+
+    largest, found = distance((0, 255, 0), (0, 0, 255)), distance(a, b)
+    if found < 0.4 * largest:
+        return 0.95 * found / (0.4 * largest)
+    return 0.95 + 0.05 * (found - 0.4 * largest) / (0.6 * largest)
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [((0, 0, 0), (255, 255, 255)), ((120, 130, 140), (123, 128, 140)), ((200, 30, 10), (10, 60, 220))],
+)
+def test_flip_of_plain_colors_is_that_of_its_closed_form(a, b):
+    pytest.importorskip("flip_evaluator")
+    images = (np.full((40, 50, 3), color, np.uint8) for color in (a, b))
+    assert metrics.flip(*images) == pytest.approx(flip_of_colors(a, b), rel=2e-3)
+
+
+def test_flip_is_zero_for_identical_images_and_grows_with_the_disturbance():
+    pytest.importorskip("flip_evaluator")
+    assert metrics.flip(PHOTOGRAPH, PHOTOGRAPH) == 0.0
+    near, far = (metrics.flip(PHOTOGRAPH, disturbed(amount)) for amount in (2, 100))
+    assert 0.0 < near < far < 1.0
+
+
+def test_flip_is_of_the_pixels_that_count_and_sees_black_in_the_others():
+    pytest.importorskip("flip_evaluator")
+    a, b = PHOTOGRAPH.copy(), disturbed(100)
+    mask = np.zeros(a.shape[:2], dtype=bool)
+    mask[:20] = True
+    before = metrics.flip(a, b, mask)
+    a[~mask], b[~mask] = 7, 200
+    assert metrics.flip(a, b, mask) == before > 0
+    assert metrics.flip(a, a, mask) == 0
+
+
+def test_flip_without_its_package_names_the_extra_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    metrics._flip_evaluate.cache_clear()
+    with pytest.raises(metrics.Unavailable, match=r"pip install '\.\[flip\]' in the project's folder"):
+        metrics.flip(PHOTOGRAPH, PHOTOGRAPH)
 
 
 def test_masked_metrics_are_those_of_the_pixels_that_count():

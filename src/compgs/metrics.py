@@ -1,4 +1,4 @@
-"""Image quality: PSNR, SSIM, LPIPS. Every number the project reports follows these conventions.
+"""Image quality: PSNR, SSIM, LPIPS, FLIP. Every number the project reports follows these conventions.
 
 - Images are uint8 [H, W, 3], display RGB: a rendering is *rounded* to 8 bits (`to_8bit`), as a file would be,
   not truncated and not left in floating point.
@@ -7,10 +7,13 @@
   mean over pixels and channels: the one of 3DGS (`compgs.numerics.ssim`).
 - LPIPS: network "vgg" as in 3DGS unless "alex" is asked for, version 0.1 through torchmetrics, inputs in
   [-1, 1]. The releases of 3DGS and CompGS feed [0, 1]: their figures are not comparable.
+- FLIP: what people see of the difference when the two images take turns on a screen, by a model of their eyes; no
+  learned weights. NVIDIA's implementation, of images of low dynamic range, seen at 67 pixels a degree (its default: a
+  screen of 3 840 pixels on 0.7 m, from as far away); mean over the pixels, 0 to 1, less is better.
 
 - With a mask [H, W] bool, True where a pixel counts (`compgs.scene.masks`): PSNR and SSIM are means over the pixels
   that count; for SSIM the others are black in both images, as what lies outside of an image is. LPIPS: black in both,
-  and the distance is divided by the share of pixels that count.
+  and the distance is divided by the share of pixels that count. FLIP: black in both, mean over the pixels that count.
 
 A metric over views is the mean of the views' metrics.
 """
@@ -30,6 +33,7 @@ from compgs.numerics.ssim import l1_and_ssim
 if TYPE_CHECKING:
     from torch import Tensor
 
+PIXELS_A_DEGREE = 67.0206  # of FLIP
 SAME_PICTURE = 100.0  # dB, about what one level in one pixel of one channel comes to
 
 # Distance of two batches [1, 3, H, W] in [-1, 1], of torch tensors.
@@ -79,6 +83,37 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     x = a.astype(np.float32) / np.float32(255.0)
     # Writable, as in training: read-only arrays would be compiled for anew.
     return l1_and_ssim(np.ascontiguousarray(x), np.require(b, requirements=("C", "W")), counted=mask)[1]
+
+
+def flip(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Visible difference (Andersson et al. 2020) of uint8 images [H, W, 3], `b` the true one; 0 for identical images.
+
+    Mean over the pixels of a mask or all. Raises Unavailable where the package is missing.
+    """
+    _check(a, b, mask)
+    evaluate = _flip_evaluate()
+    black = np.uint8(1) if mask is None else mask[:, :, None].astype(np.uint8)
+    seen, true = ((image * black).astype(np.float32) / np.float32(255.0) for image in (a, b))
+    errors = np.asarray(
+        evaluate(
+            true, seen, "LDR", applyMagma=False, computeMeanError=False, parameters={"ppd": PIXELS_A_DEGREE}
+        )[0]
+    ).reshape(a.shape[:2])
+    return float(np.mean(errors if mask is None else errors[mask], dtype=np.float64))
+
+
+def check_flip() -> None:
+    """Raises Unavailable, with the remedy, where FLIP cannot be measured."""
+    _flip_evaluate()
+
+
+@functools.cache
+def _flip_evaluate() -> Callable[..., Any]:
+    try:
+        from flip_evaluator import evaluate
+    except ImportError as error:
+        raise Unavailable(f"FLIP needs flip-evaluator ({error}): {install_line('flip')}") from error
+    return evaluate
 
 
 def lpips(

@@ -281,18 +281,26 @@ def test_a_file_that_ends_early_is_to_be_fetched_again(
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate"])
-def test_lpips_is_missed_before_anything_is_computed(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str
+@pytest.mark.parametrize(("name", "package"), [("lpips", "torchmetrics"), ("flip", "flip_evaluator")])
+def test_what_measures_is_missed_before_anything_is_computed(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    command: str,
+    name: str,
+    package: str,
 ) -> None:
     from compgs import metrics
 
-    monkeypatch.setitem(sys.modules, "torchmetrics", None)
+    monkeypatch.setitem(sys.modules, package, None)
     metrics.lpips_network.cache_clear()
+    metrics._flip_evaluate.cache_clear()
     (tmp_path / "a.cgs").write_bytes(GOLDEN_FILE.read_bytes())
     first = {"train": ["-o", tmp_path / "run"], "evaluate": [tmp_path / "a.cgs"]}[command]
-    code, _, err = outcome(capsys, command, *first, tmp_path / "nowhere", "--lpips")
+    code, _, err = outcome(capsys, command, *first, tmp_path / "nowhere", f"--{name}")
     assert code == 1
-    assert err.startswith("error: LPIPS needs") and "pip install '.[lpips]' in the project's folder" in err
+    assert err.startswith(f"error: {name.upper()} needs")
+    assert f"pip install '.[{name}]' in the project's folder" in err
     assert [path.name for path in tmp_path.iterdir()] == ["a.cgs"]
 
 

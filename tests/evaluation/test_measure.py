@@ -151,6 +151,16 @@ def test_a_scene_without_held_out_views_is_refused(file: Path) -> None:
         evaluate(file, everything_trained)
 
 
+def test_flip_is_measured_where_it_is_asked_for_and_of_all_views(file: Path) -> None:
+    pytest.importorskip("flip_evaluator")
+    scene = make_scene([101, 110, 155])
+    assert evaluate(file, scene, device="cpu").flip is None
+    results = evaluate(file, scene, flip=True, device="cpu")
+    each = [view.flip for view in results.per_view]
+    assert None not in each and each == sorted(each) and each[0] > 0
+    assert results.to_dict()["flip"] == results.flip == pytest.approx(sum(each) / 3)
+
+
 def test_missing_lpips_is_reported_with_its_reason(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from compgs import metrics
 

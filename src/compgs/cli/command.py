@@ -203,11 +203,14 @@ def allow_tmc3() -> None:
     os.environ[ASKED_BY] = "1"
 
 
-def check_lpips() -> None:
-    """Raises MissingDependency, with the remedy, where LPIPS cannot be measured."""
-    from compgs.metrics import lpips_network
+def check_measures(*, lpips: bool, flip: bool) -> None:
+    """Raises MissingDependency, with the remedy, where one that is asked for cannot be measured."""
+    from compgs.metrics import check_flip, lpips_network
 
-    lpips_network("vgg")
+    if lpips:
+        lpips_network("vgg")
+    if flip:
+        check_flip()
 
 
 def check_device(name: str) -> None:

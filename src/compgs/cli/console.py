@@ -104,6 +104,8 @@ def print_results(results: "Results") -> None:
         table.add_row("LPIPS", f"{results.lpips:.4f}")
     elif results.lpips_note != "not asked for":
         table.add_row("LPIPS", escape(str(results.lpips_note)))
+    if results.flip is not None:
+        table.add_row("FLIP", f"{results.flip:.4f}")
     table.add_row("file", f"{results.bytes:,} bytes")
     if results.splats is not None:
         table.add_row("splats", f"{results.splats:,}")

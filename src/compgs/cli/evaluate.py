@@ -12,7 +12,7 @@ from compgs.cli.command import (
     MemoryOption,
     SceneFileOrRunArgument,
     SceneOptions,
-    check_lpips,
+    check_measures,
 )
 from compgs.cli.console import print_results, say, warn
 from compgs.cli.progress import counting
@@ -50,6 +50,10 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
     lpips: FlagCreatePairsOff[bool] = False
     """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
 
+    flip: FlagCreatePairsOff[bool] = False
+    """Also measure FLIP, a perceptual measure without learned weights (needs `pip install '.[flip]'` in the project's
+    folder)."""
+
     exposure: FlagCreatePairsOff[bool] = False
     """Give each rendering the exposure of its photograph, fitted to the left half, and measure the right half; as for
     runs that were trained with --set training.exposure=true."""
@@ -67,8 +71,7 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
         if run and (otherwise := read_otherwise(run.scene, source)):
             warn(f"{file} was trained with {otherwise}")
         self.prepare("decode", "render")
-        if self.lpips:
-            check_lpips()
+        check_measures(lpips=self.lpips, flip=self.flip)
         from compgs.evaluation import evaluate
 
         scene = read_scene(source)
@@ -79,6 +82,7 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
                 output=self.output,
                 overwrite=self.overwrite,
                 lpips=self.lpips,
+                flip=self.flip,
                 device=self.device,
                 method=run.method if run else None,
                 exposure=self.exposure or (run is not None and run.config.training.exposure),

@@ -5,7 +5,7 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from compgs.cli.command import ReadingOptions, check_lpips
+from compgs.cli.command import ReadingOptions, check_measures
 from compgs.cli.console import say
 from compgs.cli.progress import counting_runs
 from compgs.cli.ranks import several
@@ -148,8 +148,7 @@ def train_tiles(command: "Train", settings: RunSettings) -> None:
     if command.cluster is not None:
         require("cluster", "--cluster")
     command.prepare_training("decode", "render")
-    if command.lpips:
-        check_lpips()
+    check_measures(lpips=command.lpips, flip=command.flip)
     path = Path(settings.scene.path).absolute()  # machines of a cluster start elsewhere
     settings = replace(settings, scene=replace(settings.scene, path=str(path)))
     scene, settings = command.read(settings)

@@ -14,7 +14,7 @@ from compgs.cli.command import (
     NO_DEFAULT,
     ComputingCommand,
     SceneOptions,
-    check_lpips,
+    check_measures,
     one_scene,
     use_threads,
 )
@@ -151,6 +151,10 @@ class Train(ComputingCommand, SceneOptions):
     lpips: FlagCreatePairsOff[bool] = False
     """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
 
+    flip: FlagCreatePairsOff[bool] = False
+    """Also measure FLIP, a perceptual measure without learned weights (needs `pip install '.[flip]'` in the project's
+    folder)."""
+
     viewer: FlagCreatePairsOff[bool] = False
     """Show the scene as it grows, in the browser, for less than a tenth of the training's speed; what comes out is the
     same (needs `pip install '.[view]'` in the project's folder)."""
@@ -198,8 +202,7 @@ class Train(ComputingCommand, SceneOptions):
             self.prepare_training("train", "encode", "decode", "render")
             if several() and self.threads is None:
                 use_threads(share_of_threads())
-            if self.lpips:
-                check_lpips()
+            check_measures(lpips=self.lpips, flip=self.flip)
             if self.viewer and leads:
                 check_viewing(self.viewer_port, "--viewer-port")
             if self.resume:
@@ -406,6 +409,7 @@ class Train(ComputingCommand, SceneOptions):
                 output=folder,
                 overwrite=True,
                 lpips=self.lpips,
+                flip=self.flip,
                 device=self.device,
                 progress=progress,
                 method=settings.method,

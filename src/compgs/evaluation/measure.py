@@ -39,6 +39,7 @@ def evaluate(
     output: str | Path | None = None,
     overwrite: bool = False,
     lpips: bool = False,
+    flip: bool = False,
     device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
     method: str | None = None,
@@ -59,12 +60,14 @@ def evaluate(
     their views, each rendering gets that of its view first, fitted to the left half, and the right half is measured
     (`compgs.evaluation.exposure`).
 
-    Raises BitstreamError, SplatFileError, OutputError, and SceneError if the scene holds no view out or a mask leaves
-    nothing.
+    Raises BitstreamError, SplatFileError, OutputError, SceneError if the scene holds no view out or a mask leaves
+    nothing, and MissingDependency where FLIP is asked for and cannot be measured.
     """
     path, scene = scene_file(Path(file)), as_scene(scene)
     if output is not None:
         check_output_folder(Path(output), overwrite=overwrite)
+    if flip:
+        metrics.check_flip()
     if not scene.test_views:
         raise SceneError(
             f"{scene.name}: no view is held out, so there is nothing to evaluate on; load with hold-out"
@@ -98,6 +101,7 @@ def evaluate(
                 ssim=metrics.ssim(seen, photograph, mask),
                 lpips=distance,
                 render_seconds=seconds,
+                flip=metrics.flip(seen, photograph, mask) if flip else None,
             )
         )
         images.append(image)

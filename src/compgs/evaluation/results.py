@@ -12,6 +12,7 @@
 | psnr | dB, mean over the views; null if infinite: all renderings are perfect |
 | ssim | mean over the views |
 | lpips | mean over the views, or null; `lpips_note` then says why |
+| flip | mean over the views, or null: it was not asked for |
 | bytes | of the whole file, or of all files of a scene in tiles |
 | components | bytes by component of the file; they sum to `bytes` |
 | anchors, coupled_primitives, splats | counts; null what the file does not have: splats are of all files but .cgs |
@@ -24,7 +25,7 @@
 | notes | sentences: in what the scene is not what the file was trained on, as far as the file's cameras tell |
 
 `per_view.json`: a list in the views' order with `name`, `file` (of `test/renders` and `test/gt`), `psnr`,
-`ssim`, `lpips`, `render_seconds`.
+`ssim`, `lpips`, `flip`, `render_seconds`.
 """
 
 import dataclasses
@@ -45,6 +46,7 @@ class ViewResult:
     ssim: float
     lpips: float | None
     render_seconds: float
+    flip: float | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,11 @@ class Results:
         return fmean(values) if len(values) == len(self.per_view) else None
 
     @property
+    def flip(self) -> float | None:
+        values = [view.flip for view in self.per_view if view.flip is not None]
+        return fmean(values) if len(values) == len(self.per_view) else None
+
+    @property
     def render_seconds(self) -> float:
         return median(view.render_seconds for view in self.per_view)
 
@@ -120,6 +127,7 @@ class Results:
             "ssim": self.ssim,
             "lpips": self.lpips,
             "lpips_note": self.lpips_note,
+            "flip": self.flip,
             "bytes": self.bytes,
             "components": self.components,
             "anchors": self.anchors,

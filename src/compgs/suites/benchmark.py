@@ -85,17 +85,19 @@ def some_of(suite: Suite, scenes: Sequence[str], methods: Sequence[str]) -> Suit
 
 
 def measurable(suite: Suite) -> tuple[Suite, list[str]]:
-    """Without LPIPS where it cannot be measured, which is said: the rest of a table is worth having."""
-    if not suite.train.get("lpips"):
-        return suite, []
-    from compgs.metrics import lpips_network
+    """Without LPIPS or FLIP where they cannot be measured, which is said: the rest of a table is worth having."""
+    from compgs.metrics import check_flip, lpips_network
 
-    try:
-        lpips_network("vgg")
-    except CompGSError as reason:
-        train = {key: value for key, value in suite.train.items() if key != "lpips"}
-        return replace(suite, train=train), [f"LPIPS is unavailable: {reason}"]
-    return suite, []
+    notes = []
+    for name, check in (("lpips", lambda: lpips_network("vgg")), ("flip", check_flip)):
+        if not suite.train.get(name):
+            continue
+        try:
+            check()
+        except CompGSError as reason:
+            suite = replace(suite, train={key: value for key, value in suite.train.items() if key != name})
+            notes.append(f"{name.upper()} is unavailable: {reason}")
+    return suite, notes
 
 
 def in_words(job: Job) -> str:

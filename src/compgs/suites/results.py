@@ -26,7 +26,7 @@ from compgs.suites.jobs import Job
 from compgs.suites.suite import PublishedRow, Suite
 
 PUBLISHED = " (published)"  # after the name of a method that did not run here
-QUALITY = ("method", "rate", "psnr", "ssim", "lpips", "bytes", "ratio")
+QUALITY = ("method", "rate", "psnr", "ssim", "lpips", "flip", "bytes", "ratio")
 TIMES = (
     "method",
     "rate",

@@ -111,7 +111,7 @@ class Suite:
 
 
 # Options of `compgs train` that a suite may give to every run; all else is a setting.
-TRAIN_OPTIONS = ("steps", "threads", "device", "lpips")
+TRAIN_OPTIONS = ("steps", "threads", "device", "lpips", "flip")
 
 
 def load_suite(name: str | Path) -> Suite:

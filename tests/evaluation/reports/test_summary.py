@@ -107,6 +107,29 @@ def test_bd_rates_of_shifted_curves_are_their_shift_by_both_measures(make_run: M
         assert row[2:] == (pytest.approx(expected, abs=1e-3), pytest.approx(expected, abs=1e-3))
 
 
+def test_a_measure_of_which_less_is_better_is_compared_as_such_where_all_runs_have_it(
+    make_run: Maker,
+) -> None:
+    def run(name: str, share: float, i: int, **more: object) -> object:
+        flip = {"flip": 0.3 / 2**i, **more}
+        size = int(share * 10_000 * 4**i)
+        return make_run(
+            f"{name}{i}", preset=name, lmbda=0.1 / 10**i, bytes=size, psnr=(20.0 + i,), results=flip
+        )
+
+    folders = [run(name, share, i) for name, share in (("paper", 1.0), ("default", 0.5)) for i in range(4)]
+    table = bd_rate_table(points_of(read_runs(folders)[0]), "compgs paper")  # type: ignore[arg-type]
+    assert table is not None and [column.title for column in table.columns[2:]] == [
+        "by PSNR",
+        "by SSIM",
+        "by FLIP",
+    ]
+    assert [table.rows[0][i] for i in (2, 4)] == pytest.approx([-0.5, -0.5], abs=1e-3)
+    folders.append(run("default", 0.5, 4, flip=None))
+    table = bd_rate_table(points_of(read_runs(folders)[0]), "compgs paper")  # type: ignore[arg-type]
+    assert table is not None and [column.title for column in table.columns[2:]] == ["by PSNR", "by SSIM"]
+
+
 def test_points_of_which_a_smaller_file_has_the_quality_are_left_out_and_counted(make_run: Maker) -> None:
     folders = [*curve(make_run, "paper", 1), *curve(make_run, "default", 0.5)]
     folders.append(make_run("worse", lmbda=0.5, bytes=40_000, psnr=(21.0,), ssim=0.65))

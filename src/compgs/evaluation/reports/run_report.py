@@ -131,28 +131,27 @@ def _overview(points: Sequence[Point], made: Sequence[Table]) -> list[str]:
 
 
 def _curves(scene: str, points: Sequence[Point], methods: Sequence[str]) -> list[str]:
-    """Two charts, by PSNR and by SSIM; a method has one color in all scenes."""
+    """A chart by each measure; a method has one color in all scenes."""
     bytes_axis = charts.Axis("size of the file", log=True, form=short_size)
     panels = []
     series: list[charts.Series] = []
-    for measure, name, form in summary.MEASURES:
+    for measure in summary.measured(points):
         series = [
             charts.Series(
                 method,
-                tuple(_chart_point(p, measure, form) for p in points if p.method == method),
+                tuple(_chart_point(p, measure) for p in points if p.method == method),
                 style=methods.index(method),
             )
             for method in dict.fromkeys(point.method for point in points)
         ]
-        unit = ", dB" if measure == "psnr" else ""
-        panels.append(charts.line_chart(series, bytes_axis, charts.Axis(name + unit)))
+        panels.append(charts.line_chart(series, bytes_axis, charts.Axis(measure.title + measure.unit)))
     return [page.heading(scene, 3), page.side_by_side(panels), charts.legend(series)]
 
 
-def _chart_point(point: Point, measure: str, form: str) -> charts.Point:
-    size, quality = point.spread("bytes"), point.spread(measure)
+def _chart_point(point: Point, measure: summary.Measure) -> charts.Point:
+    size, quality = point.spread("bytes"), point.spread(measure.key)
     assert size is not None and quality is not None
-    told = f"{point.rate} {short_size(size.mean)}, {tables.shown(quality, form)}"
+    told = f"{point.rate} {short_size(size.mean)}, {tables.shown(quality, measure.form)}"
     return charts.Point(size.mean, quality.mean, size.deviation, quality.deviation, told.strip())
 
 

@@ -12,9 +12,26 @@ from compgs.evaluation.reports.tables import Column, Spread, Table, Value
 
 PLAIN_3DGS = "3dgs"  # method that sizes are compared with
 # Numbers that seeds change; of the others the mean says enough.
-WITH_SPREAD = ("psnr", "ssim", "lpips", "bytes")
+WITH_SPREAD = ("psnr", "ssim", "lpips", "flip", "bytes")
 ALL_SCENES = "mean of all scenes"
-MEASURES = (("psnr", "PSNR", ".2f"), ("ssim", "SSIM", ".4f"))
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Of quality, over which curves are drawn and compared."""
+
+    key: str
+    title: str
+    form: str
+    unit: str = ""
+    sign: int = 1  # -1: less is better
+
+
+MEASURES = (
+    Measure("psnr", "PSNR", ".2f", ", dB"),
+    Measure("ssim", "SSIM", ".4f"),
+    Measure("flip", "FLIP", ".4f", sign=-1),
+)
 
 NAMES = (Column("scene", "scene"), Column("method", "method"), Column("rate", "rate"))
 NUMBERS = (
@@ -22,6 +39,7 @@ NUMBERS = (
     Column("psnr", "PSNR, dB", ".2f"),
     Column("ssim", "SSIM", ".4f"),
     Column("lpips", "LPIPS", ".4f"),
+    Column("flip", "FLIP", ".4f"),
     Column("bytes", "bytes", ",.0f"),
     Column("ratio", "3DGS / bytes", ".1f"),
     Column("anchors", "anchors", ",.0f"),
@@ -94,6 +112,11 @@ def methods(of: Sequence[Run] | Sequence[Point]) -> list[str]:
     return list(dict.fromkeys(each.method for each in of))
 
 
+def measured(points: Sequence[Point]) -> tuple[Measure, ...]:
+    """PSNR, SSIM, and what else all points know."""
+    return tuple(m for m in MEASURES if m.key != "flip" or all(p.mean(m.key) is not None for p in points))
+
+
 def means_table(points: Sequence[Point], count: int | None = None) -> Table | None:
     """Means over all scenes, of each method and rate that has them all; None of a single scene.
 
@@ -159,7 +182,7 @@ def front(points: Curve) -> list[tuple[float, float]]:
 
 
 def bd_rate_table(points: Sequence[Point], reference: str) -> Table | None:
-    """BD-rates of every method's curve against the reference's, by PSNR and by SSIM; None without two curves.
+    """BD-rates of every method's curve against the reference's, by every measure; None without two curves.
 
     Raises ConfigError if no run is of the method `reference`.
     """
@@ -168,26 +191,32 @@ def bd_rate_table(points: Sequence[Point], reference: str) -> Table | None:
         raise ConfigError(f"reference {reference!r}: no run is of that method; there are {', '.join(known)}")
     rows: list[tuple[Value, ...]] = []
     reasons: list[str] = []
+    measures = measured(points)
     for scene in scenes(points):
         for method in known:
             # What stands alone is no curve.
             if method == reference or len(curve(points, scene, method, "bytes")) < 2:
                 continue
             found: list[float | None] = []
-            for measure, title, _ in MEASURES:
-                rate, reason = _bd_rate(
-                    curve(points, scene, reference, measure), curve(points, scene, method, measure)
+            for measure in measures:
+                of_reference, of_method = (
+                    [
+                        (size, measure.sign * quality)
+                        for size, quality in curve(points, scene, name, measure.key)
+                    ]
+                    for name in (reference, method)
                 )
+                rate, reason = _bd_rate(of_reference, of_method)
                 found.append(rate)
-                reasons += [f"{scene}, {method}, {title}: {reason}"] if reason else []
+                reasons += [f"{scene}, {method}, {measure.title}: {reason}"] if reason else []
             rows.append((scene, method, *found))
-    if not any(row[2] is not None or row[3] is not None for row in rows):
+    if not any(value is not None for row in rows for value in row[2:]):
         return None
     rows += _mean_bd_rates(rows)
     columns = (
         Column("scene", "scene"),
         Column("method", "method"),
-        *(Column(f"bd_rate_{name}", f"by {title}", "+.1%") for name, title, _ in MEASURES),
+        *(Column(f"bd_rate_{m.key}", f"by {m.title}", "+.1%") for m in measures),
     )
     notes = (
         f"Change of bytes at equal quality, beside {reference}: less than zero is smaller.",
@@ -201,7 +230,7 @@ def _mean_bd_rates(rows: Sequence[tuple[Value, ...]]) -> list[tuple[Value, ...]]
     found = {row[0] for row in rows}
     by_method = {row[1]: [other for other in rows if other[1] == row[1]] for row in rows}
     return [
-        (ALL_SCENES, method, _mean([row[2] for row in mine]), _mean([row[3] for row in mine]))
+        (ALL_SCENES, method, *(_mean(values) for values in zip(*(row[2:] for row in mine), strict=True)))
         for method, mine in by_method.items()
         if len(mine) == len(found) > 1
     ]
@@ -238,13 +267,14 @@ def components(point: Point) -> dict[str, float]:
 
 
 def views_table(points: Sequence[Point]) -> Table:
-    """PSNR and SSIM of every view, means over the seeds; of each scene the worst view first."""
+    """PSNR, SSIM and FLIP of every view, means over the seeds; of each scene the worst view first."""
     columns = (
         Column("scene", "scene"),
         Column("view", "view"),
         *NAMES[1:],
         Column("psnr", "PSNR, dB", ".2f"),
         Column("ssim", "SSIM", ".4f"),
+        Column("flip", "FLIP", ".4f"),
     )
     rows: list[tuple[Value, ...]] = []
     for scene in scenes(points):
@@ -254,7 +284,8 @@ def views_table(points: Sequence[Point]) -> Table:
                 found = [each for run in point.runs for each in run.per_view if each.get("name") == view]
                 if found:
                     values = (fmean(psnr(each) for each in found), fmean(each["ssim"] for each in found))
-                    rows.append((scene, view, point.method, point.rate or None, *values))
+                    flip = _mean([each.get("flip") for each in found])
+                    rows.append((scene, view, point.method, point.rate or None, *values, flip))
     return Table("views", "Views", columns, tuple(rows)).without_empty_columns()
 
 
