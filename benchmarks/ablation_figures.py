@@ -30,16 +30,16 @@ def figure(name: str, scene: str, rows: Sequence[Row]) -> bytes:
         draw_components(left, rows)
         draw_bits(right, rows)
     elif name == "curve":
-        measures = list(measured(rows))
+        measures = measured(rows)
         size = (len(measures) * 0.8 * SIZE[0], SIZE[1])
         canvas, panels = pyplot.subplots(1, len(measures), figsize=size)
         for axes, measure in zip(panels, measures, strict=True):
-            draw_curves(axes, rows, measure)
-            label_axes(axes, measure)
+            draw_curves(axes, rows, measure.key)
+            label_axes(axes, measure.title, measure.unit)
     else:
         canvas, axes = pyplot.subplots(figsize=SIZE)
         draw_points(axes, rows)
-        label_axes(axes, "psnr")
+        label_axes(axes, "PSNR", ", dB")
     canvas.suptitle(f"{name}: {scene}", fontsize=11)
     return png(canvas)
 
@@ -76,10 +76,10 @@ def draw_points(axes: Any, rows: Sequence[Row]) -> None:
     axes.legend(fontsize=8)
 
 
-def label_axes(axes: Any, measure: str) -> None:
+def label_axes(axes: Any, title: str, unit: str) -> None:
     """Of a chart of quality over size."""
     axes.set_xlabel("file, kB")
-    axes.set_ylabel(f"{measure.upper()} of held-out views{', dB' if measure == 'psnr' else ''}")
+    axes.set_ylabel(f"{title} of held-out views{unit}")
     axes.grid(alpha=0.3)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from compgs.errors import ConfigError
 from compgs.evaluation.bd_rate import Curve, bd_rate
+from compgs.evaluation.reports.summary import MEASURES, Measure, front
 
 COUPLED_COMPONENTS = ("masks", "residual hyperprior", "residual embeddings")
 # Files of format version 1 call the log scales "covariance"; records of them are kept in docs/results.
@@ -149,10 +150,9 @@ def bits_each(row: Row) -> tuple[float, float]:
     return anchor / max(row.anchors or 0, 1), coupled / max(row.primitives or 0, 1)
 
 
-def measured(rows: Sequence[Row]) -> dict[str, int]:
-    """Measures that all points of curves know: PSNR, SSIM, FLIP; -1: less is better."""
-    known = {"psnr": 1, "ssim": 1, "flip": -1}
-    return {m: sign for m, sign in known.items() if all(getattr(r, m) is not None for r in rows if r.curve)}
+def measured(rows: Sequence[Row]) -> list[Measure]:
+    """Those that all points of curves know."""
+    return [m for m in MEASURES if all(getattr(row, m.key) is not None for row in rows if row.curve)]
 
 
 def curves_of(rows: Sequence[Row], measure: str) -> dict[str, list[tuple[float, float]]]:
@@ -166,11 +166,11 @@ def curves_of(rows: Sequence[Row], measure: str) -> dict[str, list[tuple[float, 
 def compare_curves(rows: Sequence[Row]) -> list[str]:
     """BD-rates of every curve against the first, and on which curves more bytes are not always better."""
     lines = []
-    for measure, sign in measured(rows).items():
-        title = measure.upper()
+    for measure in measured(rows):
+        title = measure.title
         curves = {
-            name: [(size, sign * quality) for size, quality in curve]
-            for name, curve in curves_of(rows, measure).items()
+            name: [(size, measure.sign * quality) for size, quality in curve]
+            for name, curve in curves_of(rows, measure.key).items()
         }
         first, *others = curves
         for name, curve in curves.items():
@@ -195,15 +195,6 @@ def described(reference: Curve, test: Curve) -> str:
         return f"{100 * bd_rate(reference, test):+.1f} %"
     except ConfigError as reason:
         return f"none ({reason})"
-
-
-def front(curve: Curve) -> list[tuple[float, float]]:
-    """The (bytes, quality) points, ascending, of which no smaller file of the curve has the quality."""
-    best: list[tuple[float, float]] = []
-    for point in sorted(curve):
-        if not best or point[1] > best[-1][1]:
-            best.append(point)
-    return best
 
 
 def report(name: str, scene: str, records: Sequence[Record], command: str) -> str:

@@ -13,12 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
+from compgs.evaluation.reports.summary import front
+
 OURS = "compgs default"
 HEAD = """| method | rate | PSNR, dB | SSIM | bytes | 3DGS / bytes | to ours, by PSNR | by SSIM |
 |---|---|---:|---:|---:|---:|---:|---:|"""
 
 Row = dict[str, str]
-Curve = list[tuple[int, float]]  # bytes, quality: both rise
+Curve = list[tuple[float, float]]  # bytes, quality: both rise
 
 
 def main() -> None:
@@ -50,12 +52,7 @@ def table(rows: Sequence[Row]) -> str:
 
 def our_curve(rows: Sequence[Row], measure: str) -> Curve:
     """The points of the default preset that no smaller file beats."""
-    curve: Curve = []
-    points = sorted((int(row["bytes"]), float(row[measure])) for row in rows if row["method"] == OURS)
-    for size, quality in points:
-        if not curve or quality > curve[-1][1]:
-            curve.append((size, quality))
-    return curve
+    return front([(int(row["bytes"]), float(row[measure])) for row in rows if row["method"] == OURS])
 
 
 def times(curve: Curve, size: int, quality: float) -> str:

@@ -9,11 +9,12 @@ import pytest
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 import ablation
-from ablation_tables import bits_each, front, paired_differences, rows_of
+from ablation_tables import bits_each, paired_differences, rows_of
 
 from compgs.cli.main import parse
 from compgs.cli.run_folder import save_settings
 from compgs.cli.train import Train
+from compgs.evaluation.reports.summary import front
 
 
 class Trainings:
