@@ -40,7 +40,6 @@ HTML = "html"
 FITTED_CAMERAS = 96  # of baking; fewer than the coefficients leave colors between them to chance
 COMPARED_CAMERAS = 12  # between the file's own, beside those: baking saw none of them
 LONGEST_SIDE = 800  # pixels, of cameras that baking looks through
-BUDGET_ROUNDS = 12  # of dropping splats until a file is small enough
 SOFTER = 0.5  # of what other programs dilate splats by; who has less is sharper to the eye
 LEAST_DEGREE = 1  # of harmonics, before splats are left out for a file to be small enough
 MOST_STEPS = 100_000  # of refining
@@ -107,13 +106,14 @@ def export(
         raise OutputError(f"{path}: expected a name that ends in {kinds}")
     check_output_file(path, overwrite=overwrite)
     if kind == HTML:
+        limits.check_none(path)
         return _export_page(source, path)
     write = functools.partial(spz.encoded, version=spz_version) if kind == "spz" else WRITERS[kind]
     chosen = chosen_device(device)
     model = open_scene(source, chosen)
     if isinstance(model, TiledScene):
         tile = scene_file(source).parent / model.manifest.tiles[0].file
-        raise ConfigError(
+        raise SplatFileError(
             f"{source}: tiles are exported one by one, as {tile}: together they may not fit in memory"
         )
     if not isinstance(model, HybridModel | SplatModel):
@@ -166,6 +166,19 @@ class Limits:
             if value is not None and (value < low or (high is not None and value > high)):
                 raise ConfigError(f"{name} = {value}: expected {low} to {high or 'any number'}")
 
+    def check_none(self, path: Path) -> None:
+        """Raises ConfigError if there is any, for a file that holds the scene as it is."""
+        for name, value in (
+            ("degree", self.degree),
+            ("max_splats", self.most_splats),
+            ("max_bytes", self.most_bytes),
+        ):
+            if value is not None:
+                raise ConfigError(
+                    f"{name} = {value}: {path} will hold the .cgs file as it is, no splats; leave it out, or make the "
+                    "file smaller first (compgs encode --drop)"
+                )
+
     def change(self, model: Renderable) -> bool:
         """Whether a scene's splats cannot stay as they are."""
         fewer = self.most_splats is not None or self.most_bytes is not None
@@ -181,15 +194,17 @@ class Limits:
         """The same, as many as fit; `size` is that of a file. Raises ConfigError if the bytes are too few for any."""
         if self.most_bytes is None:
             return baked
-        for _ in range(BUDGET_ROUNDS):
-            found = size(baked)
-            if found <= self.most_bytes:
-                return baked
-            fewer = int(len(baked.importance) * BUDGET_MARGIN * self.most_bytes / found)
-            if fewer < 1:
-                break
-            baked = baked.most_important(fewer)
-        raise ConfigError(f"max_bytes = {self.most_bytes}: too few for any splat, expected {found} or more")
+        least = None  # of a file with one splat
+        while (found := size(baked)) > self.most_bytes:
+            least = least or size(baked.most_important(1))
+            if least > self.most_bytes:
+                raise ConfigError(
+                    f"max_bytes = {self.most_bytes}: too few for any splat, expected {least} or more"
+                )
+            # As if all others were of one size.
+            share = BUDGET_MARGIN * (self.most_bytes - least) / (found - least)
+            baked = baked.most_important(1 + int((len(baked.importance) - 1) * share))
+        return baked
 
     def affordable_degree(self, baked: Baked, size: Callable[[Baked], int]) -> int:
         """Of the harmonics: the one asked for, else the highest with which all splats fit, LEAST_DEGREE at least.

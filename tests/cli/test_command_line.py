@@ -142,6 +142,8 @@ DEMO = ["demo-scene", "scene"]
         ([*TRAIN, "--lmbda", "nan"], "--lmbda nan: expected 0 to 100"),
         ([*TRAIN, "--seed", "-1"], "--seed -1: expected 0 to 2147483647"),
         ([*TRAIN, "--threads", "0"], "--threads 0: expected 1 to "),
+        ([*TRAIN, "--device", "gpu"], "--device gpu: expected cpu or cuda"),
+        ([*TRAIN, "--device", "gpu:1", "--method", "3dgs"], "--device gpu:1: expected cpu or cuda"),
         ([*TRAIN, "-r", "0"], "--downscale 0: expected a whole number from 1 to 32"),
         ([*TRAIN, "--test-every", "1"], "--test-every 1: expected at least 2"),
         ([*TRAIN, "--background", "0", "0", "2"], "--background (0.0, 0.0, 2.0): expected three numbers"),
@@ -161,6 +163,11 @@ DEMO = ["demo-scene", "scene"]
         ([*RENDER, "--up", "0", "0", "0"], "--up 0.0 0.0 0.0: expected a direction"),
         ([*RENDER, "--background", "2", "0", "0"], "--background (2.0, 0.0, 0.0): expected three numbers"),
         ([*RENDER, "--split", "half"], "--split: expected one of test, train, all, found 'half'"),
+        ([*RENDER, "--split", "train"], "--split train: of the views of a scene"),
+        ([*RENDER, "scene", "--frames", "5"], "--frames: of a way through the scene"),
+        ([*RENDER, "scene", "--path", "orbit"], "--path: of a way through the scene"),
+        ([*RENDER, "--cameras", "file.json", "--width", "50"], "--width: of a way through the scene"),
+        ([*RENDER, "--path", "cameras", "--elevation", "5"], "--elevation: of the circle around the scene"),
         ([*ENCODE, "--drop", "2"], "--drop 2: expected a share"),
         ([*ENCODE, "--coarser", "0.5"], "--coarser 0.5: expected a factor"),
         ([*ENCODE, "--drop", "0.5", "--geometry", "zip"], "--geometry: expected one of octree, tmc3"),
@@ -219,6 +226,8 @@ def test_values_out_of_range_are_usage_errors_in_the_words_of_the_option(
         (["info", "file"], "file: is not a .cgs file"),
         (["info", "nothing"], "nothing: is empty"),
         (["info", "full"], "full/run.cgs"),
+        (["benchmark", "nowhere", "-o", "run"], "error: nowhere: there is no such suite"),
+        (["benchmark", "file", "-o", "run"], "error: file: not TOML"),
         (["demo-scene", "full"], "overwrite"),
         (["demo-scene", "file"], "file"),
     ],
@@ -273,11 +282,13 @@ def test_a_damaged_file_is_refused_before_the_scene_is_read(
 def test_a_file_that_ends_early_is_to_be_fetched_again(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str
 ) -> None:
-    (tmp_path / "a.cgs").write_bytes(GOLDEN_FILE.read_bytes()[:-40])
     rest = {"render": ["-o", tmp_path / "out"], "evaluate": [tmp_path / "scene"]}.get(command, [])
-    code, _, err = outcome(capsys, command, tmp_path / "a.cgs", *rest)
-    assert code == 1 and err.count("\n") == 1
-    assert err.endswith("; download or copy the file again\n")
+    whole = GOLDEN_FILE.read_bytes()
+    for size in (8, 50, len(whole) // 2, len(whole) - 40):
+        (tmp_path / "a.cgs").write_bytes(whole[:size])
+        code, _, err = outcome(capsys, command, tmp_path / "a.cgs", *rest)
+        assert code == 1 and err.count("\n") == 1
+        assert err.endswith("; download or copy the file again\n") and err.count("again") == 1
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate"])

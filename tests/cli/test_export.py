@@ -29,6 +29,32 @@ def test_a_scene_is_written_and_its_loss_is_said(
     assert "beside tiny.cgs: " in said and "dB from the worst of 24 cameras" in said
 
 
+@pytest.mark.parametrize("version", [3, 4])
+def test_the_version_of_an_spz_file_can_be_chosen(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, tiny_cgs: Path, version: int
+) -> None:
+    if version == 4:
+        pytest.importorskip("zstandard")
+    options = ["--spz-version", version, "--degree", 0, "--refine", 0]
+    code, _, err = outcome(capsys, "export", tiny_cgs, tmp_path / "a.spz", *options)
+    assert (code, err) == (0, "")
+    assert (tmp_path / "a.spz").read_bytes().startswith(b"\x1f\x8b" if version == 3 else b"NGSP\x04")
+
+
+@pytest.mark.parametrize("kind", ["ply", "spz", "sog"])
+def test_the_least_size_that_is_named_is_enough_and_one_byte_less_is_not(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, tiny_cgs: Path, kind: str
+) -> None:
+    options = ["--degree", 0, "--refine", 0, "--max-bytes"]
+    _, _, err = outcome(capsys, "export", tiny_cgs, tmp_path / f"a.{kind}", *options, 10)
+    least = int(err.split("expected ")[1].split(" or more")[0])
+    code, _, err = outcome(capsys, "export", tiny_cgs, tmp_path / f"a.{kind}", *options, least - 1)
+    assert code == 2 and f"expected {least} or more" in err
+    code, said, _ = outcome(capsys, "export", tiny_cgs, tmp_path / f"a.{kind}", *options, least)
+    assert code == 0 and ", 1 splats of degree 0" in said
+    assert (tmp_path / f"a.{kind}").stat().st_size <= least
+
+
 def test_limits_are_kept_and_what_they_cost_is_said(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, tiny_cgs: Path
 ) -> None:
@@ -53,6 +79,12 @@ def test_limits_are_kept_and_what_they_cost_is_said(
         (["FILE", "a.ply", "--max-splats", "0"], 2, "--max-splats 0"),
         (["FILE", "a.ply", "--max-bytes", "much"], 2, "--max-bytes much: expected a size"),
         (["FILE", "a.ply", "--max-bytes", "10", "--refine", "0"], 2, "--max-bytes 10: too few for any splat"),
+        (
+            ["FILE", "a.html", "--max-bytes", "3kB"],
+            2,
+            "--max-bytes 3000: a.html will hold the .cgs file as it is",
+        ),
+        (["FILE", "a.html", "--degree", "1"], 2, "--degree 1: a.html will hold"),
         (["FILE"], 2, "compgs export --help"),
     ],
 )

@@ -9,9 +9,12 @@ import pytest
 from PIL import Image
 
 import compgs
+from compgs.cameras import Camera
 from compgs.cli.main import main
 from compgs.evaluation.camera_path import camera_entry
+from compgs.evaluation.measure import timed_render
 from compgs.metrics import psnr, to_8bit
+from compgs.render import Renderable
 
 SIZE = ("--width", "48", "--height", "32")
 
@@ -62,19 +65,30 @@ def test_no_old_image_stays_among_new_ones(tiny_cgs: Path, tmp_path: Path) -> No
     assert len(json.loads((out / "cameras.json").read_text())) == 2
 
 
-def test_old_images_stay_until_there_is_a_new_one(
-    tiny_cgs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("reason", [MemoryError, KeyboardInterrupt])
+def test_old_images_stay_until_all_new_ones_are_there(
+    tiny_cgs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: type[BaseException]
 ) -> None:
     out = tmp_path / "out"
     assert rendered(tiny_cgs, "--frames", 2, *SIZE, "-o", out) == 0
     before = {p.name: p.read_bytes() for p in out.iterdir()}
 
-    def failing(*_: object) -> None:
-        raise MemoryError
+    views: list[object] = []
+
+    def failing(model: Renderable, camera: Camera) -> tuple[np.ndarray, float]:
+        views.append(camera)
+        if len(views) == 2:
+            raise reason
+        return timed_render(model, camera)
 
     monkeypatch.setattr("compgs.evaluation.measure.timed_render", failing)
-    assert rendered(tiny_cgs, "--frames", 2, *SIZE, "-o", out, "--overwrite") == 1
+    others = sorted(path.name for path in tmp_path.iterdir())
+    for folder in (out, tmp_path / "other"):
+        views.clear()
+        code = rendered(tiny_cgs, "--frames", 3, *SIZE, "-o", folder, "--overwrite")
+        assert code == (130 if reason is KeyboardInterrupt else 1) and len(views) == 2
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == others
 
 
 def test_wrong_paths_are_named(tiny_cgs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,6 +98,18 @@ def test_wrong_paths_are_named(tiny_cgs: Path, tmp_path: Path, capsys: pytest.Ca
         assert f"--path {path}: " in (error := capsys.readouterr().err) and complaint in error
     assert rendered(tiny_cgs, tmp_path, "--path", write_path(tiny_cgs, one, 2), "-o", tmp_path / "out") == 2
     assert not (tmp_path / "out").exists()
+
+
+def test_the_circle_is_not_turned_where_a_file_has_cameras_of_its_own(
+    tiny_cgs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert rendered(tiny_cgs, "--up", 0, 0, 1, "-o", tmp_path / "out") == 2
+    assert "--up: of the circle around the scene; give it with --path orbit" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert (
+        rendered(tiny_cgs, "--path", "orbit", "--up", 0, 0, 1, "--frames", 1, *SIZE, "-o", tmp_path / "out")
+        == 0
+    )
 
 
 def test_a_video_of_cameras_of_two_sizes_is_refused(

@@ -17,7 +17,7 @@ from compgs.config import Config, EntropyConfig, ModelConfig
 from compgs.entropy.contexts import Hyperprior
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import weight_exponent
-from compgs.errors import CorruptSection, NotEncodable, OutputError, TruncatedSection
+from compgs.errors import ConfigError, CorruptSection, NotEncodable, OutputError, TruncatedSection
 from compgs.evaluation.camera_path import orbit
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.stored_weights import SHARED_RESIDUAL_BITS
@@ -300,9 +300,10 @@ def test_a_beginning_of_a_file_is_the_coarse_part_of_its_scene(tmp_path, config)
     assert np.array_equal(decode(path, prefix=10 * size).primitives.positions, whole.positions)
     with pytest.raises(TruncatedSection, match=r"a\.cgs: latents: of \d+ bytes nothing can be shown yet"):
         decode(path, prefix=ranges[0].bytes - 1)
-    for nothing in (0, -5):
-        with pytest.raises(TruncatedSection, match=r"a\.cgs: header"):
-            decode(path, prefix=nothing)
+    with pytest.raises(TruncatedSection, match=r"a\.cgs: header: the file ends after 0 bytes$"):
+        decode(path, prefix=0)
+    with pytest.raises(ConfigError, match="prefix = -5: expected a number of bytes"):
+        decode(path, prefix=-5)
 
 
 @pytest.mark.parametrize(("blocks", "bits"), [(0, 10), (1, 10), (2, 8), (2, 14)])

@@ -15,7 +15,7 @@ from compgs.compressing.compression import placed_cameras
 from compgs.config import Config, ModelConfig, TrainingConfig
 from compgs.errors import CheckpointError, ConfigError, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import camera_entry, read_cameras
-from compgs.formats import open_scene
+from compgs.formats import open_scene, write_ply
 from compgs.gaussians import Gaussians
 from compgs.render import render
 from compgs.render.settings import RasterSettings
@@ -63,6 +63,22 @@ def test_other_formats_are_judged_by_the_same_measure(done, ball_ply: Path, tmp_
         psnr = [metrics.psnr(*(metrics.to_8bit(render(m, c).image) for m in models)) for c in cameras]
         np.testing.assert_allclose(each.psnr, np.mean(psnr), atol=1e-6)
         assert each.psnr > 30 and 0.9 < each.ssim <= 1
+
+
+def test_splats_that_another_format_cannot_hold_are_compressed_all_the_same(
+    ball_ply: Path, config: Config, tmp_path: Path
+) -> None:
+    splats = open_scene(ball_ply).splats
+    far = tmp_path / "far.ply"
+    means = splats.means.copy()
+    means[0, 0] = 1e7  # beyond what 24 bits of .spz reach
+    write_ply(replace(splats, means=means), far)
+    done = compress(far, tmp_path / "far.cgs", config=config, looking=LOOKING)
+    assert [each.format for each in done.others] == ["sog"]
+    (note,) = done.notes
+    assert note.startswith("the same splats as .spz: ") and "positions reach 1e+07" in note
+    written = json.loads((done.folder / "results.json").read_text())["compress"]
+    assert written["notes"] == [note] and [each["format"] for each in written["others"]] == ["sog"]
 
 
 def test_what_is_trained_on_are_renderings_of_the_splats(

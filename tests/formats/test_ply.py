@@ -112,7 +112,8 @@ def without_rotation(data: bytes) -> bytes:
     [
         (lambda data: b"", "does not begin"),
         (lambda data: b"PK" + data, "does not begin"),
-        (lambda data: data[:300], "header does not end"),
+        (lambda data: data[:300], "ends after 300 bytes, within its header; copy it again"),
+        (edited(b"end_header", b"comment " + b"x" * 70_000), "header does not end within 65536 bytes"),
         (lambda data: data[:-1], "copy it again"),
         (lambda data: data + b"x", "copy it again"),
         (edited(b"vertex 5", b"vertex 6"), "copy it again"),

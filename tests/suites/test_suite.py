@@ -103,5 +103,5 @@ def test_missing_scenes_are_named_with_where_they_are_published(suite: Suite, tm
     ):
         check_scenes(suite, tmp_path)
     check_scenes(some_of(suite, ["south"], []), tmp_path)
-    with pytest.raises(ConfigError, match="scene 'east': not in the suite, which has north, south"):
+    with pytest.raises(ConfigError, match="scenes 'east': not in the suite, which has north, south"):
         some_of(suite, ["east"], [])

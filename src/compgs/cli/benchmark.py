@@ -64,19 +64,18 @@ class Benchmark(Command):
             raise UsageError(
                 f"--cpus {self.cpus:g} --gpus {self.gpus:g}: expected cores above 0, no negative GPUs"
             )
-        with settings_of_options():
-            suite = load_suite(self.suite)
-            with counting_runs("runs") as progress:
-                done = benchmark(
-                    suite,
-                    self.output,
-                    data=self.data,
-                    scenes=self.scenes,
-                    methods=self.methods,
-                    cluster=self.cluster,
-                    needs=Needs(self.cpus, self.gpus),
-                    progress=progress,
-                )
+        suite = load_suite(self.suite)
+        with settings_of_options(), counting_runs("runs") as progress:
+            done = benchmark(
+                suite,
+                self.output,
+                data=self.data,
+                scenes=self.scenes,
+                methods=self.methods,
+                cluster=self.cluster,
+                needs=Needs(self.cpus, self.gpus),
+                progress=progress,
+            )
         say("")
         say(to_markdown(done.tables[0]))
         say(f"{self.output / 'report.html'}; tables as .md, .csv and .tex beside it")

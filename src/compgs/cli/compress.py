@@ -227,6 +227,8 @@ def print_compressed(compressed: "Compressed") -> None:
     row(compressed.file.name, results.bytes, results.psnr, results.ssim, "bold")
     say(f"against the splats' own pictures, {len(results.per_view)} cameras that were not trained on:")
     console.print(table)
+    for note in compressed.notes:
+        say(f"note: {note}")
 
 
 def interrupted(output: Path) -> str:

@@ -28,8 +28,8 @@ class Info(Command, FileArgument):
             tell_tiles(manifest)
             return
         data = read_bitstream(self.file)
+        from compgs.codec.format import named
         from compgs.codec.reader import file_info
-        from compgs.formats.cgs import named
 
         with named(self.file):
             info = file_info(data)

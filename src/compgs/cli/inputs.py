@@ -7,8 +7,7 @@ from compgs.errors import NotACompGSFile
 
 def check_bitstream(path: Path) -> None:
     """Raises BitstreamError if there is no whole .cgs file to read, before anything else is read or made."""
-    from compgs.codec.format import unpack
-    from compgs.formats.cgs import named
+    from compgs.codec.format import named, unpack
 
     data = read_bitstream(path)
     with named(path):

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypedDict
 
 from tyro.conf import FlagCreatePairsOff, arg
 
@@ -15,8 +15,7 @@ from compgs.cli.progress import counting
 from compgs.cli.run_folder import RunSettings, SceneSource, file_and_run
 from compgs.cli.scenes import read_scene
 from compgs.cli.usage import UsageError, check_range
-from compgs.errors import OutputError
-from compgs.outputs import check_output_file, check_output_folder, write_bytes, write_json
+from compgs.outputs import check_output_file, check_output_folder, filling, write_bytes, write_json
 from compgs.words import duration
 
 if TYPE_CHECKING:
@@ -27,6 +26,10 @@ if TYPE_CHECKING:
     from compgs.scene import Scene
 
 BLACK = (0.0, 0.0, 0.0)
+# Of the way through a scene, and of the circle around it, where nothing else is asked for.
+FRAMES, WIDTH, HEIGHT = 60, 640, 480
+UP, ELEVATION, DISTANCE = (0.0, -1.0, 0.0), 25.0, 2.2
+OF_WAY, OF_CIRCLE = ("path", "frames", "width", "height"), ("up", "elevation", "distance")
 MAX_SIDE = 16_384  # pixels
 VIDEO_BYTES = 16 << 20  # that must be free for a video; a long one fails later
 
@@ -62,13 +65,13 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
     """Color behind everything, 0 to 1, in place of the file's own; only .cgs files have one: by default the scene's, or
     black."""
 
-    split: Literal["test", "train", "all"] = "test"
+    split: Annotated[Literal["test", "train", "all"] | None, arg(help_behavior_hint="(default: test)")] = None
     """Which views of the scene: held out, trained on, or both."""
 
     cameras: Annotated[Path | None, arg(metavar="JSON", help_behavior_hint=NO_DEFAULT)] = None
     """Camera file, whose cameras are rendered, instead of a scene."""
 
-    frames: Annotated[int, arg(metavar="N")] = 60
+    frames: Annotated[int | None, arg(metavar="N", help_behavior_hint=f"(default: {FRAMES})")] = None
     """Images of the way through the scene."""
 
     path: Annotated[
@@ -81,19 +84,26 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
     fps: Annotated[float, arg(metavar="N")] = 30.0
     """Frames per second of a video."""
 
-    width: Annotated[int, arg(metavar="PIXELS")] = 640
-    """Of the images."""
+    width: Annotated[int | None, arg(metavar="PIXELS", help_behavior_hint=f"(default: {WIDTH})")] = None
+    """Of the images of the way."""
 
-    height: Annotated[int, arg(metavar="PIXELS")] = 480
-    """Of the images."""
+    height: Annotated[int | None, arg(metavar="PIXELS", help_behavior_hint=f"(default: {HEIGHT})")] = None
+    """Of the images of the way."""
 
-    up: Annotated[tuple[float, float, float], arg(metavar="X Y Z")] = (0.0, -1.0, 0.0)
+    up: Annotated[
+        tuple[float, float, float] | None,
+        arg(metavar="X Y Z", help_behavior_hint=f"(default: {UP[0]:g} {UP[1]:g} {UP[2]:g})"),
+    ] = None
     """Direction of the sky, for the circle."""
 
-    elevation: Annotated[float, arg(metavar="DEGREES")] = 25.0
+    elevation: Annotated[
+        float | None, arg(metavar="DEGREES", help_behavior_hint=f"(default: {ELEVATION:g})")
+    ] = None
     """Of the circle, above the horizon."""
 
-    distance: Annotated[float, arg(metavar="RADII")] = 2.2
+    distance: Annotated[float | None, arg(metavar="RADII", help_behavior_hint=f"(default: {DISTANCE:g})")] = (
+        None
+    )
     """Of the circle from the middle of the scene."""
 
     overwrite: FlagCreatePairsOff[bool] = False
@@ -109,11 +119,12 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
         self.check_output()
         if self.cameras is not None and (self.scene or self.source):
             raise UsageError("both a scene and --cameras were given; give one")
+        source = self.views_source(run)
+        self.check_use(source)
         keyframes = self.keyframes()
         self.prepare("decode", "render")
         from compgs.devices import chosen_device
 
-        source = self.views_source(run)
         scene = read_scene(source) if source else None
         views = self.given_views(scene)
         model = open_scene(file, chosen_device(self.device), scene.background if scene else BLACK)
@@ -128,15 +139,48 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
     def check_values(self) -> None:
         """Raises UsageError."""
         self.check_reading()
-        check_range("--frames", self.frames, 1, 100_000)
-        check_range("--width", self.width, 1, MAX_SIDE)
-        check_range("--height", self.height, 1, MAX_SIDE)
-        check_range("--elevation", self.elevation, -89, 89)
-        check_range("--fps", self.fps, 1, 240)
-        if not 0 < self.distance < float("inf"):
+        for name, low, high in (
+            ("frames", 1, 100_000),
+            ("width", 1, MAX_SIDE),
+            ("height", 1, MAX_SIDE),
+            ("elevation", -89, 89),
+            ("fps", 1, 240),
+        ):
+            value = getattr(self, name)
+            if value is not None:
+                check_range(f"--{name}", value, low, high)
+        if self.distance is not None and not 0 < self.distance < float("inf"):
             raise UsageError(f"--distance {self.distance}: expected a finite number above 0")
-        if not any(self.up) or not all(map(math.isfinite, self.up)):
+        if self.up is not None and (not any(self.up) or not all(map(math.isfinite, self.up))):
             raise UsageError(f"--up {' '.join(map(str, self.up))}: expected a direction, not all of it zero")
+
+    def check_use(self, source: SceneSource | None) -> None:
+        """Raises UsageError for an option that what is asked for has no use for: views of the scene or of a camera
+        file, a way through the cameras of a file, or a circle.
+        """
+        views = source is not None or self.cameras is not None
+        if views and (name := self.first_given(*OF_WAY, *OF_CIRCLE)):
+            raise UsageError(
+                f"--{name}: of a way through the scene, but its views, or a camera file's, were asked for; leave it "
+                "out, or ask for a way alone, as with compgs render FILE --path orbit"
+            )
+        if self.split is not None and source is None:
+            raise UsageError(f"--split {self.split}: of the views of a scene; give the scene, too")
+        if self.path not in (None, "orbit") and (name := self.first_given(*OF_CIRCLE)):
+            raise UsageError(f"--{name}: of the circle around the scene; give it with --path orbit")
+
+    @property
+    def pictures(self) -> "Pictures":
+        """How many frames a way has, and their size."""
+        return {
+            "frames": self.frames or FRAMES,
+            "width": self.width or WIDTH,
+            "height": self.height or HEIGHT,
+        }
+
+    def first_given(self, *options: str) -> str | None:
+        """Of these options the first that was given."""
+        return next((name for name in options if getattr(self, name) is not None), None)
 
     def views_source(self, run: RunSettings | None) -> SceneSource | None:
         """The scene whose views are rendered, if any are: that of a run's folder is read as in training."""
@@ -163,8 +207,6 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
         file = Path(str(self.path))
         if not file.is_file():
             raise UsageError(f"--path {self.path}: expected cameras, orbit or a camera file; there is none")
-        if self.cameras is not None or self.scene or self.source:
-            raise UsageError("--path is a way of its own; leave out the scene and --cameras")
         keyframes = [camera for _, camera in read_cameras(file)]
         if len(keyframes) < 2:
             raise UsageError(f"--path {self.path}: a way needs two cameras at least, found {len(keyframes)}")
@@ -182,7 +224,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
             "test": scene.test_views,
             "train": scene.train_views,
             "all": (*scene.train_views, *scene.test_views),
-        }[self.split]
+        }[self.split or "test"]
         if not chosen:
             raise UsageError(f"--split {self.split}: the scene has no such views")
         return [(view.name, view.camera) for view in chosen]
@@ -192,14 +234,16 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
         from compgs.evaluation.tour import tour, way_through
 
         if keyframes:
-            way = way_through(keyframes, frames=self.frames, width=self.width, height=self.height)
+            way = way_through(keyframes, **self.pictures)
             return [(f"path {i}", camera) for i, camera in enumerate(way)]
         cameras = model.viewpoints
         if self.path == "orbit" or (self.path is None and len(cameras) < 2):
             return self.circle(model)
+        if name := self.first_given(*OF_CIRCLE):
+            raise UsageError(f"--{name}: of the circle around the scene; give it with --path orbit")
         if len(cameras) < 2:
             raise UsageError(f"--path cameras: {self.file} keeps {len(cameras)} cameras; use --path orbit")
-        return tour(cameras, frames=self.frames, width=self.width, height=self.height)
+        return tour(cameras, **self.pictures)
 
     def circle(self, model: "Renderable") -> "Sequence[tuple[str, Camera]]":
         import numpy as np
@@ -208,12 +252,10 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
 
         circle = orbit(
             model.bounds[0],
-            frames=self.frames,
-            width=self.width,
-            height=self.height,
-            up=self.up,
-            elevation=self.elevation,
-            distance=self.distance,
+            **self.pictures,
+            up=self.up or UP,
+            elevation=ELEVATION if self.elevation is None else self.elevation,
+            distance=self.distance or DISTANCE,
         )
         # Around the model's own frame; cameras are given in the world's.
         return [(name, camera.moved(-np.array(model.world_offset))) for name, camera in circle]
@@ -242,11 +284,18 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
         from compgs.evaluation.camera_path import camera_entry
         from compgs.evaluation.measure import encode_png
 
-        for i, image in enumerate(frames):
-            if i == 0:  # now that there is something to take their place
-                remove_images(self.output)
-            write_bytes(self.output / f"{i:05d}.png", encode_png(image))
-        write_json(self.output / "cameras.json", [camera_entry(camera, name) for name, camera in views])
+        with filling(self.output) as folder:
+            for i, image in enumerate(frames):
+                write_bytes(folder / f"{i:05d}.png", encode_png(image))
+            write_json(folder / "cameras.json", [camera_entry(camera, name) for name, camera in views])
+
+
+class Pictures(TypedDict):
+    """Those of a way."""
+
+    frames: int
+    width: int  # pixels
+    height: int  # pixels
 
 
 def rendered(
@@ -263,12 +312,3 @@ def rendered(
         times.append(seconds)
         yield image
         progress(i + 1, len(cameras))
-
-
-def remove_images(folder: Path) -> None:
-    """Those of an earlier rendering, and the file that says what they are. Raises OutputError."""
-    try:
-        for old in (*folder.glob("[0-9][0-9][0-9][0-9][0-9].png"), folder / "cameras.json"):
-            old.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: old images cannot be removed ({error.strerror})") from error

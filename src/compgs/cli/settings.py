@@ -58,9 +58,10 @@ def parse_value(kind: Any, text: str) -> Any:
     """Raises ValueError that says what was expected."""
     origin, options = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Literal:
-        if text not in options:
-            raise ValueError(f"expected one of {', '.join(map(str, options))}, found {text!r}")
-        return text
+        for option in options:  # which need not be texts
+            if text == str(option):
+                return option
+        raise ValueError(f"expected one of {', '.join(map(str, options))}, found {text!r}")
     if origin in (types.UnionType, typing.Union):
         if text.lower() == "none":
             return None

@@ -14,6 +14,7 @@ from compgs.cli.command import (
     NO_DEFAULT,
     ComputingCommand,
     SceneOptions,
+    check_device,
     check_measures,
     one_scene,
     use_threads,
@@ -189,6 +190,8 @@ class Train(ComputingCommand, SceneOptions):
         if self.resume and self.overwrite:
             raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
         require("train", "training")
+        if self.device is not None:
+            check_device(self.device)
         folder = self.output
         with among_ranks(self.device) as leads:
             if leads:

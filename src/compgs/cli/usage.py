@@ -55,8 +55,13 @@ def settings_of_options() -> Iterator[None]:
 
 
 def _of_an_option(message: str) -> str:
-    """`training.steps = 0: ...` is `--steps 0: ...`; where there is no such option, `--set training.steps=0: ...`."""
+    """`training.steps = 0: ...` is `--steps 0: ...`; where there is no such option, `--set training.steps=0: ...`. What
+    does not begin with the name of a setting or an argument, but with that of a file, stays as it is.
+    """
     name, _, rest = message.partition(" ")
+    section, _, key = name.partition(".")
+    if not (section.isidentifier() and (name == section or (key.isidentifier() and rest.startswith("= ")))):
+        return message
     rest = rest.removeprefix("= ")
     if name in OPTIONS:
         return f"{OPTIONS[name]} {rest}"

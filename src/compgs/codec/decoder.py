@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from compgs.codec.content import Dimensions, FileContent, Latents, Role
+from compgs.codec.format import named
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.codec.reader import read_latents
 from compgs.codec.viewpoint_cameras import camera_from_viewpoint
 from compgs.devices import placed
-from compgs.errors import BitstreamError, CorruptSection, NotACompGSFile
+from compgs.errors import ConfigError, CorruptSection, NotACompGSFile
 from compgs.model.arrays import PrimitiveArrays
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.head_weights import HeadDimensions, HeadWeights
@@ -32,12 +33,15 @@ def decode(path: "str | Path", device: "Device | None" = None, *, prefix: int | 
     """The scene in a .cgs file, as numpy arrays; with a `device` ("cuda") it is drawn there.
 
     `prefix`: of the file's first bytes alone, as if the rest had not arrived yet: a coarser scene.
-    Raises a BitstreamError that names the file and the section if it cannot be decoded, or read at all.
+    Raises a BitstreamError that names the file and the section if it cannot be decoded, or read at all, and ConfigError
+    for a negative `prefix`.
     """
     path = Path(path)
+    if prefix is not None and prefix < 0:
+        raise ConfigError(f"prefix = {prefix}: expected a number of bytes")
     try:
         with path.open("rb") as file:
-            data = file.read(-1 if prefix is None else max(0, prefix))
+            data = file.read(-1 if prefix is None else prefix)
     except OSError as error:
         raise NotACompGSFile(f"{path}: cannot be read ({error.strerror})") from error
     return decode_bytes(data, path, device, prefix=prefix is not None)
@@ -51,11 +55,9 @@ def decode_bytes(
     prefix: bool = False,
 ) -> HybridModel:
     """The scene in the bytes of a file, or in the beginning of them. Raises BitstreamError, as `decode`."""
-    try:
+    with named(path, prefix=prefix):
         content, latents = read_latents(data, keep_symbols=False, prefix=prefix)
         model = from_latents(content, latents)
-    except BitstreamError as error:
-        raise type(error)(f"{path}: {error}") from error
     return placed(model, device)
 
 

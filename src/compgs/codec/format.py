@@ -8,9 +8,19 @@ Knows nothing of what the sections hold beyond their numbers.
 
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
-from compgs.errors import CorruptSection, NotACompGSFile, NotEncodable, TruncatedSection, UnsupportedVersion
+from compgs.errors import (
+    BitstreamError,
+    CorruptSection,
+    NotACompGSFile,
+    NotEncodable,
+    TruncatedSection,
+    UnsupportedVersion,
+)
 
 MAGIC = b"\x93CGS"  # not text, and not valid UTF-8
 VERSION = 5
@@ -93,6 +103,20 @@ class Section:
         return SECTION_NAMES.get(self.number, f"section {self.number}")
 
 
+@contextmanager
+def named(path: Path, *, prefix: bool = False) -> Iterator[None]:
+    """A BitstreamError inside becomes one that names the file, and what to do about it. `prefix`: only the beginning of
+    the file was asked for, and that it ends early is no damage.
+    """
+    try:
+        yield
+    except (TruncatedSection, CorruptSection) as error:
+        remedy = "" if prefix and isinstance(error, TruncatedSection) else "; download or copy the file again"
+        raise type(error)(f"{path}: {error}{remedy}") from error
+    except BitstreamError as error:
+        raise type(error)(f"{path}: {error}") from error
+
+
 def container_bytes(sections: int) -> int:
     """Bytes of a file that belong to no section."""
     return _HEADER.size + sections * _ENTRY.size + _CRC.size
@@ -120,7 +144,7 @@ def unpack(data: bytes, *, prefix: bool = False) -> list[Section]:
     if (len(data) < len(MAGIC) and MAGIC.startswith(data)) or (
         data[:4] == MAGIC and len(data) < _HEADER.size
     ):
-        raise TruncatedSection(f"header: the file ends after {len(data)} bytes; copy or download it again")
+        raise TruncatedSection(f"header: the file ends after {len(data)} bytes")
     if data[: len(MAGIC)] != MAGIC:
         raise NotACompGSFile("not a .cgs file: it does not begin as one")
     _, version, flags, count = _HEADER.unpack_from(data)
@@ -131,8 +155,7 @@ def unpack(data: bytes, *, prefix: bool = False) -> list[Section]:
         )
     if len(data) < container_bytes(count):
         raise TruncatedSection(
-            f"header: {count} sections need {container_bytes(count)} bytes, the file ends after {len(data)}; "
-            "copy or download it again"
+            f"header: {count} sections need {container_bytes(count)} bytes, the file ends after {len(data)}"
         )
     at = container_bytes(count)
     head = data[: at - _CRC.size]
@@ -157,8 +180,7 @@ def unpack(data: bytes, *, prefix: bool = False) -> list[Section]:
                     f"{section.name}: of {len(data)} bytes nothing can be shown yet, the first scene takes {needed}"
                 )
             raise TruncatedSection(
-                f"{section.name}: header promises {length} bytes, the file ends after {len(section.data)}; "
-                "copy or download it again"
+                f"{section.name}: header promises {length} bytes, the file ends after {len(section.data)}"
             )
         if zlib.crc32(section.data) != crc:
             raise CorruptSection(

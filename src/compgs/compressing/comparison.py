@@ -8,6 +8,7 @@ from statistics import fmean
 
 from compgs import metrics
 from compgs.devices import CPU
+from compgs.errors import SplatFileError
 from compgs.formats import encoded, open_scene
 from compgs.model.splats import ORIGIN, SplatModel
 from compgs.render import Renderable, render
@@ -26,14 +27,26 @@ class Compared:
     ssim: float
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """What other formats make of the splats, and why some of them cannot hold these."""
+
+    files: tuple[Compared, ...]
+    notes: tuple[str, ...]
+
+
 def compare(
     model: SplatModel, views: Sequence[View], formats: Sequence[str] = COMPARED, *, device: str = CPU
-) -> tuple[Compared, ...]:
+) -> Comparison:
     """By the same measure as a file of ours: 8-bit pictures against those of the splats."""
-    rows = []
+    rows, notes = [], []
     with tempfile.TemporaryDirectory() as folder:
         for name in formats:
-            data = encoded(model.at(ORIGIN).splats, name)
+            try:
+                data = encoded(model.at(ORIGIN).splats, name)
+            except SplatFileError as error:  # what one of them cannot hold, ours may
+                notes.append(f"the same splats as .{name}: {str(error).partition(';')[0]}")
+                continue
             file = Path(folder, f"same.{name}")
             file.write_bytes(data)
             again = open_scene(file, device, model.background)
@@ -41,7 +54,7 @@ def compare(
             # Neither format says where positions count from.
             again = again.at(model.world_offset)
             rows.append(Compared(name, len(data), *quality(again, views)))
-    return tuple(rows)
+    return Comparison(tuple(rows), tuple(notes))
 
 
 def quality(model: Renderable, views: Sequence[View]) -> tuple[float, float]:

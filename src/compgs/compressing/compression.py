@@ -57,6 +57,7 @@ class Compressed:
     steps: int
     results: Results  # on cameras that were not trained on
     others: tuple[Compared, ...]  # the same splats in other formats, by the same measure
+    notes: tuple[str, ...] = ()  # why they are not in one of these
 
     def to_dict(self) -> dict[str, Any]:
         """The content of `results.json`: that of an evaluation, and `compress`."""
@@ -67,6 +68,7 @@ class Compressed:
                 "source_splats": self.splats,
                 "steps": self.steps,
                 "others": [asdict(each) for each in self.others],
+                "notes": list(self.notes),
             }
         }
 
@@ -152,6 +154,7 @@ class Compression:
             progress=progress,
             truth=self.begun.source.name,
         )
+        compared = compare(self.splats, self.scene.test_views, device=self.device)
         compressed = Compressed(
             source=self.begun.source,
             source_bytes=sum(component_bytes(self.begun.source).values()),
@@ -160,7 +163,8 @@ class Compression:
             folder=folder,
             steps=self.begun.config.training.steps,
             results=results,
-            others=compare(self.splats, self.scene.test_views, device=self.device),
+            others=compared.files,
+            notes=compared.notes,
         )
         write_json(folder / "results.json", compressed.to_dict())
         return compressed

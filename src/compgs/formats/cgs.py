@@ -1,11 +1,7 @@
 """Our own files, as one format among others: `compgs.codec` reads them."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-from compgs.errors import BitstreamError, CorruptSection, TruncatedSection
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -21,21 +17,10 @@ def begins(head: bytes) -> bool:
 
 def check(path: Path) -> None:
     """Raises BitstreamError if the file is not whole."""
-    from compgs.codec.format import unpack
+    from compgs.codec.format import named, unpack
 
     with named(path):
         unpack(path.read_bytes())
-
-
-@contextmanager
-def named(path: Path) -> Iterator[None]:
-    """A BitstreamError inside becomes one that names the file, and what to do about it."""
-    try:
-        yield
-    except (TruncatedSection, CorruptSection) as error:
-        raise type(error)(f"{path}: {error}; download or copy the file again") from error
-    except BitstreamError as error:
-        raise type(error)(f"{path}: {error}") from error
 
 
 def read(path: Path, device: "Device") -> "HybridModel":

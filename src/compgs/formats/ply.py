@@ -196,6 +196,8 @@ def read_ply_header(path: str | Path) -> PlyHeader:
     newline = begin.find(b"\n", end)
     if not begins(begin):
         raise SplatFileError(f"{path}: does not begin as a .ply file does")
+    if (end < 0 or newline < 0) and size <= len(begin):
+        raise SplatFileError(f"{path}: ends after {size} bytes, within its header; copy it again")
     if end < 0 or newline < 0:
         raise SplatFileError(f"{path}: the header does not end within {MAX_HEADER_BYTES} bytes")
     lines = begin[:end].decode("ascii", errors="replace").split("\n")

@@ -173,8 +173,8 @@ def tile_bytes(folder: Path, tile: TileEntry) -> bytes:
 
 def component_bytes(path: Path) -> dict[str, int]:
     """Bytes of each component of all tiles together, and of the manifest. Raises BitstreamError."""
+    from compgs.codec.format import named
     from compgs.codec.reader import file_info
-    from compgs.formats.cgs import named
 
     manifest = read_manifest(path)
     total: dict[str, int] = {}

@@ -71,8 +71,8 @@ def benchmark(
 def some_of(suite: Suite, scenes: Sequence[str], methods: Sequence[str]) -> Suite:
     """Raises ConfigError for a name that the suite does not have."""
     for asked, known, what in (
-        (scenes, [scene.name for scene in suite.scenes], "scene"),
-        (methods, [method.name for method in suite.methods], "method"),
+        (scenes, [scene.name for scene in suite.scenes], "scenes"),
+        (methods, [method.name for method in suite.methods], "methods"),
     ):
         for name in asked:
             if name not in known:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import Config, TrainingConfig, check_config, load_config
+from compgs.devices import check_device
 from compgs.errors import ConfigError, TrainingError
 from compgs.gaussians import Gaussians
 from compgs.interrupt import held_back
@@ -126,8 +127,13 @@ def rasterize_step(
 
 
 def chosen_device(device: str | torch.device | None) -> torch.device:
-    """The given one, else CUDA where there is one; of several processes on a machine each has its own GPU."""
-    return local_device(torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu")))
+    """The given one, else CUDA where there is one; of several processes on a machine each has its own GPU.
+
+    Raises ConfigError for a device that is not known or not there, MissingDependency where packages for it are missing.
+    """
+    name = str(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    check_device(name)
+    return local_device(torch.device(name))
 
 
 def chosen_config(config: Config | None, preset: str | None) -> Config:
