@@ -155,9 +155,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
             raise UsageError(f"--up {' '.join(map(str, self.up))}: expected a direction, not all of it zero")
 
     def check_use(self, source: SceneSource | None) -> None:
-        """Raises UsageError for an option that what is asked for has no use for: views of the scene or of a camera
-        file, a way through the cameras of a file, or a circle.
-        """
+        """Raises UsageError for an option of a way where views are rendered, and the other way round."""
         views = source is not None or self.cameras is not None
         if views and (name := self.first_given(*OF_WAY, *OF_CIRCLE)):
             raise UsageError(
@@ -166,8 +164,6 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
             )
         if self.split is not None and source is None:
             raise UsageError(f"--split {self.split}: of the views of a scene; give the scene, too")
-        if self.path not in (None, "orbit") and (name := self.first_given(*OF_CIRCLE)):
-            raise UsageError(f"--{name}: of the circle around the scene; give it with --path orbit")
 
     @property
     def pictures(self) -> "Pictures":
@@ -233,14 +229,14 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
         """Through the given cameras, along the file's, or in a circle. Raises UsageError."""
         from compgs.evaluation.tour import tour, way_through
 
-        if keyframes:
-            way = way_through(keyframes, **self.pictures)
-            return [(f"path {i}", camera) for i, camera in enumerate(way)]
         cameras = model.viewpoints
         if self.path == "orbit" or (self.path is None and len(cameras) < 2):
             return self.circle(model)
         if name := self.first_given(*OF_CIRCLE):
             raise UsageError(f"--{name}: of the circle around the scene; give it with --path orbit")
+        if keyframes:
+            way = way_through(keyframes, **self.pictures)
+            return [(f"path {i}", camera) for i, camera in enumerate(way)]
         if len(cameras) < 2:
             raise UsageError(f"--path cameras: {self.file} keeps {len(cameras)} cameras; use --path orbit")
         return tour(cameras, **self.pictures)
