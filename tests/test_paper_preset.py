@@ -65,7 +65,6 @@ PUBLISHED = {
     "model.twice_coupled_where_few": 0.0,
     "model.networks_by_price": False,
     "training.entropy_lr": (2e-4, 1e-5),
-    "training.anchor_memory": 1000.0,  # Adam's beta of squared gradients: 0.999
     "training.schedule": "cosine",
     "training.head_warm_up": 0.0,
     "training.hard_rate": 1.0,
@@ -115,8 +114,6 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         "training.seed": "",
         "training.target_bytes": "",
         "training.quantized_weights": "how weights are stored",
-        "training.sparse_adam": "off",
-        "training.head_optimizer": "Adam",
         "training.exposure": "off",
         "training.appearance_dtype": "float32",
         "training.entropy_lr_steps": "bounds of short runs",
@@ -130,8 +127,7 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         if section != "splats"
     }
     assert names == PUBLISHED.keys() | free.keys()
-    assert paper.training.head_optimizer == "adam"
-    assert paper.training.sparse_adam is False and paper.training.appearance_dtype == "float32"
+    assert paper.training.appearance_dtype == "float32"
 
 
 def test_entropy_networks_have_two_residual_blocks_of_width_32_and_a_linear_skip(model: TrainedModel) -> None:

@@ -53,7 +53,6 @@ CONFIG = Config(
         rate_every=2,
         sampled_gradients=0.0,  # which ones are in a sample depends on the last bit of all before them
         hard_rate=0.75,
-        sparse_adam=True,
     ),
 )
 

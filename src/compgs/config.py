@@ -227,8 +227,6 @@ class TrainingConfig:
     covariance_lr: LearningRates = (4e-3, 4e-5)
     opacity_lr: LearningRates = (2e-3, 2e-5)
     color_lr: LearningRates = (8e-3, 8e-5)
-    # steps whose squared gradients Adam remembers, of what each anchor has for itself; of all else 1 000 (Ref.)
-    anchor_memory: Annotated[float, Range(1, 1e6, above=True)] = 1000.0
     # of all these rates (Sec. 4.1; Ref.: exponential)
     schedule: Literal["cosine", "exponential"] = "cosine"
     # of the steps in which the heads come up to their learning rates
@@ -240,11 +238,6 @@ class TrainingConfig:
     entropy_lr_steps: Annotated[int, Range(0, 10_000_000)] = 0
     # of the steps before the networks' weights are trained as they will be stored
     quantized_weights: Share = 0.8
-    # Adam moves, and lets decay the moments of, only the anchors in view (Taming 3DGS)
-    sparse_adam: bool = False
-    # of the heads' matrices; soap: Adam in the eigenbases of the gradients' moments (`training/soap.py`). It
-    # learns faster in 1 500 steps, and is behind after 5 000.
-    head_optimizer: Literal["adam", "soap"] = "adam"
     # in which the networks of opacity and color compute; bfloat16 is meant for GPUs
     appearance_dtype: Literal["float32", "bfloat16"] = "float32"
     # of the steps before the likelihood sees symbols in place of noise (soft then hard)

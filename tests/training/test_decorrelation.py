@@ -209,12 +209,8 @@ def test_learning_rates_follow_the_root_of_the_spread_down_to_a_limit() -> None:
     torch.testing.assert_close(channel_rates(references), torch.tensor([3.5, 1.75, 0.6]).double())
 
 
-@pytest.mark.parametrize("sparse", [False, True])
-def test_each_channel_moves_as_far_as_its_rate_says(
-    blob_scene: Scene, tiny_config: Config, sparse: bool
-) -> None:
-    config = replace(tiny_config, training=replace(tiny_config.training, sparse_adam=sparse))
-    plain, other = trained(blob_scene, config), trained(blob_scene, config)
+def test_each_channel_moves_as_far_as_its_rate_says(blob_scene: Scene, tiny_config: Config) -> None:
+    plain, other = trained(blob_scene, tiny_config), trained(blob_scene, tiny_config)
     assert torch.equal(plain.model.references, other.model.references)
     before = plain.model.references.detach().clone()
     rates = torch.linspace(0.0, 3.5, before.shape[1])

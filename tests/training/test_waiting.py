@@ -15,7 +15,6 @@ from compgs.render import RasterResult
 from compgs.tensors.visibility import visible_mask
 from compgs.training import loop as loop_module
 from compgs.training import trainer as trainer_module
-from compgs.training.optimizers import adam_rows
 from compgs.training.trainer import Trainer
 
 META = torch.device("meta")
@@ -64,15 +63,12 @@ def test_choosing_among_primitives_would_need_values(blob_scene, tiny_config, mo
         trainer.train_step()
 
 
-def test_culling_and_sparse_adam_need_no_values(blob_scene):
+def test_culling_needs_no_values(blob_scene):
     camera = blob_scene.train_views[0].camera
     mask = visible_mask(
         torch.zeros(7, 3, device=META), torch.zeros(7, device=META), camera, trainer_module.RasterSettings()
     )
     assert mask.shape == (7,)
-    state = [torch.zeros(7, 5, device=META) for _ in range(4)]
-    group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15}
-    adam_rows(torch.zeros(3, dtype=torch.int64, device=META), *state, torch.ones((), device=META), group)
 
 
 def test_leaving_nothing_out_trains_the_same_model(blob_scene, tiny_config, monkeypatch):

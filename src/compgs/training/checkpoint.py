@@ -36,7 +36,7 @@ from compgs.training.restoring import (
 )
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
-CHECKPOINT_VERSION = "10"
+CHECKPOINT_VERSION = "11"
 
 
 @dataclass(frozen=True)

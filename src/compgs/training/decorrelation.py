@@ -25,7 +25,6 @@ from torch import Tensor
 from compgs.tensors.linear import transposed_product
 from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import replace_parameter
-from compgs.training.soap import forget_bases
 
 # Learning rate of a channel that spreads over one step; it goes with the root of the spread, down to the second number.
 # Rates a seventh higher and lower came out alike (docs/results/decisions.md).
@@ -64,7 +63,6 @@ def decorrelate(model: TrainedModel, optimizer: torch.optim.Optimizer) -> None:
     for parameter, dimension, first in _along_references(model):
         _turn(parameter.data, dimension, first, axes)
         state = optimizer.state.get(parameter, {})
-        forget_bases(state)
         if "exp_avg" in state:
             _turn(state["exp_avg"], dimension, first, axes)
             # As if gradients of different channels had nothing in common: more than the squares is not known.

@@ -12,31 +12,26 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Protocol
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from compgs.config import TrainingConfig
-from compgs.numerics.compiled import njit, portion
 from compgs.trained_model import TrainedModel
-from compgs.training.soap import Soap, forget_bases
 
 HEAD_GROUPS = ("geometry", "appearance", "translation", "covariance", "opacity", "color")
-ROW_CHUNKS = 32
 ADAM_EPSILON = 1e-15  # gradients of single primitives are tiny (3DGS)
-BETAS = (0.9, 0.999)  # Adam's, for one view a step; of anchors the second is `training.anchor_memory`'s
+BETAS = (0.9, 0.999)  # Adam's, for one view a step
 
 
 def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.Adam:
     """Groups carry their name and (first, last) learning rate; `set_learning_rates` moves between them."""
     heads, entropy = model.heads, model.entropy
-    of_anchors = BETAS[0], 1 - 1 / config.anchor_memory
     longer = max(1.0, config.entropy_lr_steps / config.steps)
     entropy_lr = config.entropy_lr[0] * longer, config.entropy_lr[1] * longer
 
     def group(name: str, parameters: Iterable[nn.Parameter], rates: tuple[float, float]) -> dict:
         rates = rates_for(config.views_per_step, rates)
-        betas = betas_for(config.views_per_step, of_anchors if name in model.anchor_parameters else BETAS)
+        betas = betas_for(config.views_per_step)
         return {"name": name, "params": list(parameters), "lr": rates[0], "rates": rates, "betas": betas}
 
     groups = [
@@ -54,8 +49,6 @@ def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.A
         "color": config.color_lr,
     }
     groups += [group(name, network.parameters(), head_rates[name]) for name, network in heads.networks()]
-    if config.head_optimizer == "soap":
-        return Soap(groups, HEAD_GROUPS, BETAS, ADAM_EPSILON)
     return torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
 
 
@@ -105,73 +98,6 @@ def exponential_decay(first: float, last: float, progress: float) -> float:
 
 
 DECAYS = {"cosine": cosine_decay, "exponential": exponential_decay}
-
-
-@torch.no_grad()
-def step_rows(model: TrainedModel, optimizer: torch.optim.Adam, rows: Tensor) -> None:
-    """Adam's step for the anchors in `rows` [V] int64, ascending; the step of `optimizer` then leaves anchors alone.
-
-    What is not in view has no gradient. Dense Adam moves it all the same, by its old momentum, and lets the momentum
-    decay; here both wait until the anchor is seen again (as SelectiveAdam of gsplat; Mallick et al. 2024). The bias
-    corrections count all steps.
-    """
-    groups = {group["name"]: group for group in optimizer.param_groups}
-    for name in model.anchor_parameters:
-        parameter, group = getattr(model, name), groups[name]
-        if parameter.grad is None:
-            continue
-        state = optimizer.state[parameter]
-        if not state:
-            state["step"] = torch.zeros((), device=parameter.device)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        state["step"] += 1
-        parts = parameter.detach(), parameter.grad, state["exp_avg"], state["exp_avg_sq"]
-        if parameter.device.type == "cpu":
-            (beta1, beta2), steps = group["betas"], float(state["step"])
-            rate = group["lr"] * math.sqrt(1 - beta2**steps) / (1 - beta1**steps)
-            epsilon = group["eps"] * math.sqrt(1 - beta2**steps)
-            numbers = np.array([rate, 1 - beta1, 1 - beta2, epsilon], np.float32)
-            p, g, m, v = (part.reshape(len(part), -1).numpy() for part in parts)
-            _adam_rows(rows.numpy(), p, g, m, v, numbers)
-        else:
-            adam_rows(rows, *parts, state["step"], group)
-        parameter.grad = None
-
-
-def adam_rows(
-    rows: Tensor,  # [V] int64
-    parameter: Tensor,  # [N, C], changed
-    gradient: Tensor,  # [N, C]
-    first: Tensor,  # [N, C] mean of the gradient, changed
-    second: Tensor,  # [N, C] mean of its square, changed
-    steps: Tensor,  # [] number of this step, from 1
-    group: dict,  # lr, betas, eps
-) -> None:
-    """Plain torch, any device and type; nothing is read back from the device."""
-    beta1, beta2 = group["betas"]
-    g = gradient.index_select(0, rows)
-    m = first.index_select(0, rows).lerp_(g, 1 - beta1)
-    v = second.index_select(0, rows).mul_(beta2).addcmul_(g, g, value=1 - beta2)
-    first.index_copy_(0, rows, m)
-    second.index_copy_(0, rows, v)
-    # expm1: 1 - 0.999^steps would lose digits in the first steps
-    correction1, correction2 = (-torch.expm1(steps * math.log(beta)) for beta in (beta1, beta2))
-    denominator = (v / correction2).sqrt_().add_(group["eps"])
-    parameter.index_add_(0, rows, m / correction1 / denominator, alpha=-group["lr"])
-
-
-@njit(parallel=True, fastmath={"contract", "nsz", "arcp"}, error_model="numpy")
-def _adam_rows(rows, parameter, gradient, first, second, numbers, share):
-    """`adam_rows` on the CPU in one pass. numbers: rate and epsilon with the bias corrections in them, 1 - betas."""
-    for chunk in portion(ROW_CHUNKS, share):
-        rate, new1, new2, epsilon = numbers[0], numbers[1], numbers[2], numbers[3]
-        for i in range(len(rows) * chunk // ROW_CHUNKS, len(rows) * (chunk + 1) // ROW_CHUNKS):
-            r = rows[i]
-            p, g, m, v = parameter[r], gradient[r], first[r], second[r]
-            for c in range(len(p)):
-                mean, square = m[c] + new1 * (g[c] - m[c]), v[c] + new2 * (g[c] * g[c] - v[c])
-                m[c], v[c] = mean, square
-                p[c] -= rate * mean / (np.sqrt(square) + epsilon)
 
 
 class AnchorRows(Protocol):
@@ -237,7 +163,6 @@ def replace_parameter(
         group["params"] = [new if p is old else p for p in group["params"]]
     state = optimizer.state.pop(old, None)
     if state:
-        forget_bases(state)
         for moment in ("exp_avg", "exp_avg_sq"):
             state[moment] = (change_moment or change)(state[moment])
         optimizer.state[new] = state

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from compgs.errors import CheckpointError, ConfigError, SceneError
-from compgs.training.soap import BASES
 
 # What Python, torch and numpy raise for content of another kind than was written.
 _MISFITS = (
@@ -61,25 +60,20 @@ ADAM = ("step", "exp_avg", "exp_avg_sq")
 
 
 def check_moments(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor]) -> None:
-    """What an optimizer remembers, by `parameter/moment`: Adam's moments, and of matrices perhaps the bases that these
-    are in. Raises ValueError, KeyError.
-    """
+    """Raises ValueError, KeyError for what is not Adam's moments, by `parameter/moment`."""
     found: dict[str, set[str]] = {}
     for name, value in tensors.items():
         parameter, moment = name.rsplit("/", 1)
         of = parameters[parameter]
-        if moment in ADAM:
-            shape: Sequence[int] = () if moment == "step" else of.shape
-        elif moment in BASES and of.dim() == 2:
-            shape = 2 * (of.shape[BASES[moment]],)
-        else:
+        if moment not in ADAM:
             raise ValueError(f"{name} is no moment of Adam's")
+        shape: Sequence[int] = () if moment == "step" else of.shape
         check_tensor(value, shape, torch.float32 if moment == "step" else of.dtype, f"moment {name}")
         if moment in ("step", "exp_avg_sq") and (value < 0).any():
             raise ValueError(f"moment {name}: expected nothing below 0")
         found.setdefault(parameter, set()).add(moment)
     for parameter, moments in found.items():
-        missing = {*ADAM, *(BASES if moments & BASES.keys() else ())} - moments
+        missing = {*ADAM} - moments
         if missing:
             raise ValueError(f"moments are missing, such as {parameter}/{min(missing)}")
 

@@ -82,7 +82,7 @@ from compgs.training.loop import (
     run_to_end,
 )
 from compgs.training.network_size import head_bits
-from compgs.training.optimizers import DECAYS, make_optimizer, parameters_of, set_learning_rates, step_rows
+from compgs.training.optimizers import DECAYS, make_optimizer, parameters_of, set_learning_rates
 from compgs.training.profile import StepProfile
 from compgs.training.pruning import judged, paying, squared_changes
 from compgs.training.rate_control import RateState
@@ -383,8 +383,6 @@ class Trainer:
         set_learning_rates(self.optimizer, self.progress, DECAYS[t.schedule], t.head_warm_up)
         references, rates = self.model.references.detach(), self.reference_rates
         before = references.clone() if rates is not None else references
-        if t.sparse_adam:
-            step_rows(self.model, self.optimizer, looks.seen.rows)
         self.optimizer.step()
         if rates is not None:
             references.copy_(before.lerp_(references, rates))
