@@ -25,6 +25,9 @@ __all__ = [
 ]
 
 MAX_LOG_SCALE = 88.0  # its exponential is the largest that float32 holds
+# Of a splat that has no extent along an axis: the smallest scale that float32 holds in full precision.
+FLAT_LOG_SCALE = float(np.log(np.finfo(np.float32).tiny))
+MOST_DEGREE_HELD = 4  # of harmonics in files; those above MAX_DEGREE are left out
 Y0 = 0.28209479177387814  # the harmonic of degree 0: sqrt(1 / 4 pi)
 COLOR_OFFSET = 0.5  # of a color, where all coefficients are zero
 # An opacity of 8 bits is 0 or 1 at its ends, of which there is no finite logit.

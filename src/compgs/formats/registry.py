@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from compgs.devices import placed
 from compgs.errors import NotACompGSFile, OutputError, SplatFileError
-from compgs.formats import cgs, glb, packed, ply, sog, splat, spz, tiled
+from compgs.formats import cgs, glb, packed, ply, ply_text, sog, splat, spz, tiled
 from compgs.formats.arrays import SplatArrays
 from compgs.model.splats import SplatModel
 
@@ -58,9 +58,11 @@ def _open_tiles(path: Path, device: "Device", background: Background) -> "Render
     return tiled.open_tiles(path, device)
 
 
-# In the order in which they are asked: tiles before .sog, as both may be JSON; .splat, which nothing marks, comes last.
+# In the order in which they are asked: .ply of text before the binary one, tiles before .sog, as both may be JSON;
+# .splat, which nothing marks, comes last.
 FORMATS = (
     Format("cgs", cgs.begins, cgs.check, cgs.component_bytes, _open_cgs),
+    Format("ply", ply_text.begins, ply_text.check, ply_text.component_bytes, _opens_splats(ply_text.read)),
     Format("ply", ply.begins, ply.check, ply.component_bytes, _opens_splats(ply.read)),
     Format("spz", spz.begins, spz.check, spz.component_bytes, _opens_splats(spz.read)),
     Format("tiles", tiled.begins, tiled.check, tiled.component_bytes, _open_tiles),
@@ -95,7 +97,7 @@ def scene_name(path: Path) -> str:
 def format_of(path: Path) -> Format:
     """Of a file that is there. Raises NotACompGSFile for one that is of no known format, or is no file."""
     path = scene_file(path)
-    names = ", ".join(f".{each.name}" for each in FORMATS[1:])
+    names = ", ".join(dict.fromkeys(f".{each.name}" for each in FORMATS[1:]))
     if path.is_dir():
         files = sorted(path.glob("*.cgs")) or sorted(path.glob("meta.json"))
         hint = f"; did you mean {files[0]}?" if files else ""

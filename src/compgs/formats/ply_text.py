@@ -1,0 +1,92 @@
+"""Splats as a .ply file of text: the properties of `ply`, a number after the other, in place of bytes."""
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from compgs.errors import SplatFileError
+from compgs.formats import ply
+from compgs.formats.arrays import MAX_DEGREE, SplatArrays
+
+FORMAT = "format ascii 1.0"
+_LEAST_BYTES = 2  # of a number: a digit, and a blank before the next
+_BLOCK = 1 << 20  # bytes of text that are split into words at once
+
+
+def begins(head: bytes) -> bool:
+    """Whether a file begins as a .ply of text does."""
+    return ply.begins(head) and head.split(b"\n")[1].split() == FORMAT.encode().split()
+
+
+def check(path: Path) -> None:
+    """Raises SplatFileError for what can be known without reading the splats."""
+    _header(path)
+
+
+def read(path: Path) -> SplatArrays:
+    """Raises SplatFileError."""
+    header = _header(path)
+    names = header.row.names or ()
+    numbers = np.empty(header.count * len(names), np.float32)
+    with open(path, "rb") as file:
+        file.seek(header.start)
+        _fill(numbers, path, file, names)
+    table = numbers.view([(name, np.float32) for name in names])
+    return ply.splats_of(path, header, table)
+
+
+def component_bytes(path: Path) -> dict[str, int]:
+    """Bytes of each component of a file; they sum to its size. What a number takes is not told apart."""
+    header = _header(path)
+    return {"header": header.start, "splats": header.bytes - header.start}
+
+
+def _header(path: Path) -> ply.PlyHeader:
+    """Checked against the size of the file."""
+    lines, start, size = ply.header_lines(path)
+    count, columns, _ = ply.vertices(path, lines, FORMAT)
+    row = np.dtype(columns)
+    held = ply.degree_held(path, row)
+    least = _LEAST_BYTES * count * len(columns) - 1  # nothing need follow the last number
+    if size - start < least:
+        raise SplatFileError(
+            f"{path}: {count} splats of {len(columns)} numbers are at least {least} bytes of text, "
+            f"the file has {size - start}; copy it again"
+        )
+    return ply.PlyHeader(count, min(held, MAX_DEGREE), row, start, size, held)
+
+
+def _fill(numbers: np.ndarray, path: Path, file: BinaryIO, names: tuple[str, ...]) -> None:
+    """With the first numbers of a text; what follows them belongs to other elements. Raises SplatFileError."""
+    done, cut = 0, b""
+    while done < len(numbers):
+        block = file.read(_BLOCK)
+        words = (cut + block).split()
+        # The last word may go on in the next block, unless this is the end, or a blank ends it.
+        cut = words.pop() if words and block and not block[-1:].isspace() else b""
+        if len(cut) > _BLOCK or (not block and not words):
+            raise SplatFileError(
+                f"{path}: ends after {done} of {len(numbers)} numbers, or is not text; copy it again"
+            )
+        words = words[: len(numbers) - done]
+        with np.errstate(over="ignore"):  # what is too large becomes infinite, as in a binary file
+            numbers[done : done + len(words)] = _parsed(path, words, done, names)
+        done += len(words)
+
+
+def _parsed(path: Path, words: list[bytes], first: int, names: tuple[str, ...]) -> np.ndarray:
+    """[len(words)] float64. Raises SplatFileError, naming the first word that is no number."""
+    try:
+        return np.fromiter(map(float, words), np.float64, len(words))
+    except ValueError:
+        for i, word in enumerate(words, first):
+            try:
+                float(word)
+            except ValueError:
+                splat, column = divmod(i, len(names))
+                found = word[:20].decode("ascii", errors="replace")
+                raise SplatFileError(
+                    f"{path}: {names[column]} of splat {splat} is {found!r}, expected a number; copy it again"
+                ) from None
+        raise
