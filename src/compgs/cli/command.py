@@ -4,15 +4,19 @@ import dataclasses
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from compgs.cli.console import say
 from compgs.cli.run_folder import SceneSource
 from compgs.cli.sizes import parse_size
 from compgs.cli.usage import UsageError, check_range, settings_of_options
 from compgs.errors import ConfigError
 from compgs.extras import require
+
+if TYPE_CHECKING:
+    from compgs.devices import Choice
 
 NO_DEFAULT = ""  # instead of "(default: None)" in the help
 
@@ -42,19 +46,32 @@ class ComputingCommand(Command):
     def prepare(self, *stages: str) -> None:
         """Apply `threads`, check `device`; let helpers compile what some stages of work need, where nothing has been
         compiled yet. Raises UsageError, ConfigError."""
-        if self.threads != 1 and self.device in (None, "cpu"):
+        if self.device is not None:
+            check_device(self.device)
+        self.start_helpers(*stages)
+        if self.threads is not None:
+            use_threads(self.threads)
+
+    def start_helpers(self, *stages: str) -> None:
+        """Let helpers compile the kernels of some stages of work. With one thread there are none."""
+        if self.threads != 1:
             from compgs.numerics.ahead import start_helpers
 
             start_helpers(*stages)
-        if self.threads is not None:
-            use_threads(self.threads)
-        if self.device is not None:
-            check_device(self.device)
 
     def prepare_training(self, *stages: str) -> None:
-        """`prepare`, for what trained models need. Raises MissingDependency without torch, too."""
+        """`prepare`, for what trains models: say where it computes, and compile what a GPU needs before the first step.
+        Raises MissingDependency without torch, too."""
         require("train", "training")
-        self.prepare(*stages)
+        chosen = choose_device(self.device)
+        on_gpu = chosen.name != "cpu"
+        # On a GPU no kernel of the CPU trains; files are written and read by them all the same.
+        self.start_helpers(*(stage for stage in stages if not on_gpu or stage in ("encode", "decode")))
+        if self.threads is not None:
+            use_threads(self.threads)
+        if on_gpu or "GPU," in chosen.reason:
+            say(f"computing on {chosen.name}" + (f": {chosen.reason}" if chosen.reason else ""))
+        prepare_device(chosen.name)
         if self.threads is not None:
             import torch
 
@@ -211,6 +228,22 @@ def check_measures(*, lpips: bool, flip: bool) -> None:
         lpips_network("vgg")
     if flip:
         check_flip()
+
+
+def choose_device(device: str | None) -> "Choice":
+    """The device that a command computes on, and why. Raises ConfigError, MissingDependency."""
+    from compgs import devices
+
+    if device is not None:
+        check_device(device)
+    return devices.choose(device)
+
+
+def prepare_device(name: str) -> None:
+    """Load or compile what computes on a device; say so where that takes minutes. Raises MissingDependency."""
+    from compgs import devices
+
+    devices.prepare_device(name, say)
 
 
 def check_device(name: str) -> None:

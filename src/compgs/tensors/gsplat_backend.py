@@ -5,8 +5,14 @@ tensor that lies on the path from parameters to image: densification reads its g
 gsplat 1.5.
 """
 
+import contextlib
 import functools
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from types import ModuleType
 
 import torch
@@ -28,8 +34,7 @@ def rasterize_gsplat(gaussians: Gaussians, camera: Camera, settings: RasterSetti
     means, opacities = gaussians.means, gaussians.opacities
     background = background_on(settings.background, means.device)
     if len(gaussians) == 0:
-        image = background.expand(camera.height, camera.width, 3)
-        return RasterResult(image, image.new_ones(image.shape[:2]), means[:, :2], opacities > 0)
+        return nothing_drawn(gaussians, camera, background)
 
     view, intrinsics = camera_on(camera, means.device)
     radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
@@ -82,9 +87,17 @@ def check_settings(settings: RasterSettings) -> None:
         )
 
 
+def nothing_drawn(gaussians: Gaussians, camera: Camera, background: Tensor) -> RasterResult:
+    """The background alone. Its gradient by every Gaussian is zero, where there would otherwise be none."""
+    parts = gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors
+    zero = sum(part.sum() for part in parts) * 0.0
+    image = background.expand(camera.height, camera.width, 3) + zero
+    transmittance = image.new_ones(camera.height, camera.width) + zero
+    return RasterResult(image, transmittance, gaussians.means[:, :2] * 1.0, gaussians.opacities > 0)
+
+
 def load_gsplat() -> ModuleType:
     """The gsplat package. Raises MissingDependency where it cannot work."""
-    # Asked first: without a device, importing gsplat next to an nvcc starts to compile its kernels.
     if not torch.cuda.is_available():
         raise MissingDependency(
             "rendering on CUDA: no CUDA device is available; move the Gaussians to the CPU"
@@ -96,6 +109,34 @@ def load_gsplat() -> ModuleType:
             f"rendering on CUDA needs gsplat ({error}); {install_line('cuda')}"
         ) from error
     return gsplat
+
+
+def build_kernels(say: Callable[[str], None]) -> None:
+    """Load gsplat's compiled kernels, or compile them; `say` is told before minutes pass.
+
+    gsplat compiles them on first use, once for an installation. Done here, before a run, the first step does not wait
+    for it, and it can be interrupted. Raises MissingDependency where there are no kernels and no compiler.
+    """
+    load_gsplat()
+    if importlib.util.find_spec("gsplat.csrc") is None and not _built_before():
+        say("compiling gsplat's CUDA kernels, once for this installation: some 5 to 20 minutes")
+    try:
+        with contextlib.redirect_stdout(sys.stderr):  # gsplat prints, and stdout may be a program's
+            backend = importlib.import_module("gsplat.cuda._backend")
+    except (ImportError, OSError, RuntimeError) as error:
+        raise MissingDependency(f"gsplat's CUDA kernels could not be compiled: {error}") from error
+    if backend._C is None:
+        raise MissingDependency(
+            "rendering on CUDA: gsplat has no compiled kernels, and nvcc to compile them was not found; "
+            "install the CUDA toolkit (nvcc), or use --device cpu"
+        )
+
+
+def _built_before() -> bool:
+    """Whether an earlier process compiled the kernels."""
+    from torch.utils.cpp_extension import _get_build_directory
+
+    return any(Path(_get_build_directory("gsplat_cuda", verbose=False)).glob("gsplat_cuda.*"))
 
 
 # Small tensors that would otherwise be copied to the device, and waited for, at every view.

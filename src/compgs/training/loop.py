@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from compgs import devices
 from compgs.cameras import Camera
 from compgs.config import Config, TrainingConfig, check_config, load_config
-from compgs.devices import check_device
 from compgs.errors import ConfigError, TrainingError
 from compgs.gaussians import Gaussians
 from compgs.interrupt import held_back
@@ -74,6 +74,7 @@ class Run:
         self.resume = resume
         self.on_progress = on_progress
         self.device = chosen_device(device)
+        devices.prepare_device(str(self.device))
         self.profile = profile
         self.watch = watch
 
@@ -127,13 +128,11 @@ def rasterize_step(
 
 
 def chosen_device(device: str | torch.device | None) -> torch.device:
-    """The given one, else CUDA where there is one; of several processes on a machine each has its own GPU.
+    """The given device, or the best that works here; of several processes on a machine each has its own GPU.
 
     Raises ConfigError for a device that is not known or not there, MissingDependency where packages for it are missing.
     """
-    name = str(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    check_device(name)
-    return local_device(torch.device(name))
+    return local_device(torch.device(devices.chosen_device(device)))
 
 
 def chosen_config(config: Config | None, preset: str | None) -> Config:
