@@ -39,6 +39,8 @@ MAX_SYMBOL = 2**18
 FREE_SYMBOLS, SYMBOLS_PER_BYTE = 2**20, 128
 FREE_NETWORK_PRODUCTS, NETWORK_PRODUCTS_PER_BYTE = 2**28, 2**15
 FREE_HEAD_PRODUCTS, HEAD_PRODUCTS_PER_BYTE = 2**30, 2**17
+FREE_FLAGS, FLAGS_PER_BYTE = 2**20, 16
+FREE_NODES, NODES_PER_BYTE = 2**18, 4
 MAX_METADATA_BYTES = 4096
 SMALLEST, LARGEST = 2.0**-64, 2.0**64
 SMALLEST_DILATION, LARGEST_DILATION = 2.0**-40, 1.0
@@ -864,14 +866,14 @@ class Positions:
         return [((2 * o + 1 << 12) >> self.depth) - 4096 for o in self.offsets[i]]
 
 
-def read_positions(data: bytes, anchors: int) -> Positions:
+def read_positions(data: bytes, anchors: int, most_nodes: int) -> Positions:
     fields = Fields(data, NAMES[POSITIONS])
     fields.require(4 * len(data) >= anchors, f"{len(data)} bytes for {anchors} anchors")
     depth = fields.number("B", 0, 21, "depth")
     fields.require(anchors <= 8**depth, f"{anchors} anchors in {8**depth} voxels")
     x, y, z = (16 * fields.signed(what="origin", most=4) for _ in range(3))
     coder = ArithmeticDecoder(data[fields.at :], fields.name)
-    offsets = walk(coder, depth, anchors)
+    offsets = walk(coder, depth, anchors, most_nodes)
     used = fields.at + coder.end()
     fields.require(len(data) == max(used, -(-anchors // 4)), f"{len(data) - used} bytes are left over")
     fields.require(not any(data[used:]), "the bytes left over are not zero")
@@ -888,8 +890,9 @@ def read_positions(data: bytes, anchors: int) -> Positions:
     return Positions(depth, [moved((x, y, z), v) for v in offsets], offsets, [level for level, _ in order])
 
 
-def walk(coder: ArithmeticDecoder, depth: int, anchors: int) -> list[Cell]:
+def walk(coder: ArithmeticDecoder, depth: int, anchors: int, most_nodes: int) -> list[Cell]:
     """Offsets, in the order of the code."""
+    nodes = 0
     direct = [State() for _ in range(368)]
     occupancy = Mixer(7, 16384, 400, 4)
     single = Mixer(5, 16384, 400, 4)
@@ -899,6 +902,8 @@ def walk(coder: ArithmeticDecoder, depth: int, anchors: int) -> list[Cell]:
     waiting: list[tuple[Cell, int, int]] = [((0, 0, 0), 1, 0)] if anchors > 1 else []
     for step in range(depth):
         height = depth - 1 - step
+        nodes += len(waiting)
+        require(nodes <= most_nodes, coder.name, f"{nodes} nodes or more, expected up to {most_nodes}")
         exists = {node: "waiting" for node, _, _ in waiting}
         state: dict[Cell, int] = {child(node, c): UNKNOWN for node, _, _ in waiting for c in range(8)}
         for v in offsets:
@@ -1347,11 +1352,12 @@ def decode(data: bytes, prefix: bool = False) -> dict[str, Any]:
     anchors = sum(head.anchors for head in heads) if prefix else scene.anchors
     coupled = sum(head.coupled for head in heads) if prefix else scene.coupled
     check_symbols(scene, anchors, len(data))
+    check_flags(scene, len(data))
     model = read_model(file, scene, anchors, len(data))
     tensors = read_heads(sections[HEADS], file.version, scene, coupled, len(data), model.gaussian)
     if GPCC in sections:
         raise MissingDependency("positions (G-PCC): this decoder has no G-PCC")
-    positions = read_positions(sections[POSITIONS], scene.anchors)
+    positions = read_positions(sections[POSITIONS], scene.anchors, FREE_NODES + NODES_PER_BYTE * len(data))
     mask = read_masks(sections[MASKS], scene.anchors, scene.coupled_primitives)
     found = sum(map(sum, mask))
     require(found == scene.coupled, "masks", f"{found} coupled primitives, expected {scene.coupled}")
@@ -1386,6 +1392,11 @@ def check_symbols(scene: Scene, anchors: int, n: int) -> None:
     width = sum(group.width(scene.coupled_primitives) for group in scene.groups)
     allowed = FREE_SYMBOLS + SYMBOLS_PER_BYTE * n
     require(anchors * width <= allowed, "scene", f"{anchors * width} symbols, expected up to {allowed}")
+
+
+def check_flags(scene: Scene, n: int) -> None:
+    flags, allowed = scene.anchors * scene.coupled_primitives, FREE_FLAGS + FLAGS_PER_BYTE * n
+    require(flags <= allowed, "scene", f"{flags} flags of masks, expected up to {allowed}")
 
 
 def read_model(file: File, scene: Scene, anchors: int, n: int) -> Model:

@@ -199,6 +199,18 @@ def test_a_beginning_is_not_taken_for_a_damaged_file() -> None:
         unpack(file_of_ranges() + b"x", prefix=True)
 
 
+def test_of_a_beginning_what_is_found_first_in_the_order_of_the_file_decides() -> None:
+    """A damaged section before one that has not arrived is damage; behind it, it has not arrived either."""
+    data = bytearray(file_of_ranges())
+    ends = dict(section_ends(bytes(data)))
+    data[ends[POSITIONS] - 1] ^= 1
+    for prefix in (False, True):
+        with pytest.raises(CorruptSection, match="positions: its checksum"):
+            unpack(bytes(data[: ends[HEADS]]), prefix=prefix)
+        with pytest.raises(TruncatedSection, match="positions"):
+            unpack(bytes(data[: ends[POSITIONS] - 1]), prefix=prefix)
+
+
 def test_document_and_code_agree_on_the_constants() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     stated = dict(re.findall(r"^\| `([A-Z_0-9]+)` \| ([^|]+?) \|", text, re.MULTILINE))

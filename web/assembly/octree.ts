@@ -4,6 +4,7 @@ import { alloc, release } from "./memory";
 import { Mixer, choose, decide, decideByState, endDecoder, mix, newMixer, newStates, startDecoder } from "./mixing";
 
 /** Beyond what the walk returns as the code's end. */
+const TOO_MANY_NODES = -3;
 const WRONG_COUNT = -2;
 const BAD_END = -1;
 const NOTHING = -1;
@@ -110,7 +111,15 @@ function childHolding(anchor: i32, height: i32): i32 {
 }
 
 /** Offsets [n, 3] at `out`. Returns the place behind the code, or a negative number that says what is wrong. */
-export function walkOctree(payload: usize, start: i32, length: i32, n: i32, levels: i32, out: usize): i32 {
+export function walkOctree(
+  payload: usize,
+  start: i32,
+  length: i32,
+  n: i32,
+  levels: i32,
+  mostNodes: i32,
+  out: usize,
+): i32 {
   offsets = out;
   anchors = n;
   depth = levels;
@@ -129,7 +138,10 @@ export function walkOctree(payload: usize, start: i32, length: i32, n: i32, leve
   for (let j = 0; j < 27; j++) store<i32>(neighbours + (<usize>j << 2), j === 13 ? 0 : NOTHING);
   store<u8>(siblings, 1);
   store<u8>(index, 0);
+  let nodes: i64 = 0;
   for (let step = 0; step < depth && count > 0; step++) {
+    nodes += count;
+    if (nodes > <i64>mostNodes) return TOO_MANY_NODES;
     if (!walkLevel(base, step, occupancies, singles)) return WRONG_COUNT;
   }
   if (found !== anchors) return WRONG_COUNT;

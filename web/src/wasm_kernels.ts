@@ -71,11 +71,21 @@ class WasmKernels implements Kernels {
     wasm.setRowTables(this.put(expected), this.put(seen), this.put(seenBase), this.put(ratios));
   }
 
-  walkOctree(payload: Uint8Array, start: number, anchors: number, depth: number, section: string) {
+  walkOctree(
+    payload: Uint8Array,
+    start: number,
+    anchors: number,
+    depth: number,
+    mostNodes: number,
+    section: string,
+  ) {
     return this.within(() => {
       const at = this.put(payload);
       const out = this.wasm.alloc(12 * anchors);
-      const end = this.wasm.walkOctree(at, start, payload.length, anchors, depth, out);
+      const most = Math.min(mostNodes, 2 ** 31 - 1);
+      const end = this.wasm.walkOctree(at, start, payload.length, anchors, depth, most, out);
+      if (end === -3)
+        throw new CorruptSection(`${section}: more than ${mostNodes} nodes, the most for this file`);
       if (end === -2) throw new CorruptSection(`${section}: the octree does not hold ${anchors} anchors`);
       checkEnd(end, section);
       return { offsets: new Int32Array(this.wasm.memory.buffer, out, 3 * anchors).slice(), end };

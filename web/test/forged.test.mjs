@@ -135,6 +135,20 @@ test("ranges twice, or out of order, are refused", () => {
   );
 });
 
+test("of a beginning, what is found first in the order of the file decides", () => {
+  const damaged = Buffer.from(files[0].bytes);
+  const start = 11 + 9 * original.length;
+  damaged[start] ^= 1; // the first section, the scene
+  for (const prefix of [false, true]) {
+    const decodeIt = (length) => () => decode(damaged.subarray(0, length), { prefix });
+    assert.throws(decodeIt(start + original[0].payload.length), {
+      name: "CorruptSection",
+      message: /^scene/,
+    });
+    assert.throws(decodeIt(start + original[0].payload.length - 1), { name: "TruncatedSection" });
+  }
+});
+
 test("a missing section is named, and so is one that is unknown and must not be skipped", () => {
   refuses(without(MASKS), "CorruptSection", /section 4, masks, is missing/);
   refuses(without(POSITIONS), "CorruptSection", /0 kinds of positions/);

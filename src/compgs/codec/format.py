@@ -77,6 +77,12 @@ MAX_SYMBOL = 1 << 18  # absolute value of a symbol: latents in Q12 fit into 32 b
 # says more (1/16 bit a symbol) is refused; a model that compresses so well is padded.
 FREE_SYMBOLS = 1 << 20
 SYMBOLS_PER_BYTE = 128
+# Flags of masks, and nodes that the walk of the octree codes, likewise. Trained scenes have at most half a flag and a
+# tenth of a node a byte; the constants are a fraction of a second's work on one core.
+FREE_FLAGS = 1 << 20
+FLAGS_PER_BYTE = 16
+FREE_NODES = 1 << 18
+NODES_PER_BYTE = 4
 # Products (multiplications of entropy networks, and of prediction heads) that decoding and drawing a file of n bytes
 # may take: a constant and so many a byte. Trained scenes take at most a twentieth of the second; the constants are a
 # fraction of a second's work on one core.

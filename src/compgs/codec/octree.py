@@ -295,6 +295,7 @@ def _code_single(
 
 # ---- the walk
 
+CODED, WRONG_COUNT, TOO_MANY_NODES = 0, -1, -2  # what `_walk` returns; lengths of codes are positive
 # Number of contexts of each mixed input; `_walk` says what they are made of. 21 levels, 8 children.
 _OCCUPANCY_SIZES = [8 * 4 * 256, 729 * 8 * 5, 128 * 8 * 5, 13 * 20 * 5, 21 * 8 * 8 * 8, 64 * 256, 256 * 8 * 8]
 _SINGLE_SIZES = [21 * 8 * 8, 13 * 20 * 4, 27 * 27 * 4, 256 * 8, 27 * 13 * 8]
@@ -332,13 +333,14 @@ def _walk(
     frontier: Frontier,
     next_frontier: Frontier,
     place: NDArray[np.int32],  # [N / 2] scratch: places of the frontier's nodes
-) -> bool:
-    """Code the tree. False: the data are not those of N anchors."""
+    most_nodes: int,
+) -> Int:
+    """Code the tree. Returns CODED, or what is wrong."""
     count = len(found)
     sides = np.zeros(3, np.int64)
     if count == 1:
         found[0] = _code_single(coder, data, models.direct, 0 if decoding else codes[0], depth, sides)
-        return True
+        return CODED
     blocks = np.zeros(8, np.int64)
     children_first = np.zeros(9, np.int64)
     occupancy, single = models.occupancy, models.single
@@ -346,7 +348,11 @@ def _walk(
     input.node[0], input.first[0], input.family[0] = 0, 0, 1
     waiting = 1
     done = 0
+    nodes: Int = 0
     for step in range(depth):
+        nodes += waiting
+        if nodes > most_nodes:
+            return TOO_MANY_NODES
         height = depth - 1 - step  # bits per axis below the children
         scale = min(height, 7)
         least = 2 if height == 0 else 1  # children of a node that holds two anchors or more
@@ -356,7 +362,7 @@ def _walk(
             node = input.node[i]
             if decoding:
                 if is_exhausted(coder, data):
-                    return False
+                    return WRONG_COUNT
             else:
                 child_first = np.int64(input.first[i])
                 for c in range(8):
@@ -454,7 +460,7 @@ def _walk(
                 # Nodes that wait hold two anchors or more each; this bounds every array.
                 left = count - done - 2 * (new + waiting - 1 - i)
                 if left < (1 if alone else 2):
-                    return False
+                    return WRONG_COUNT
                 if alone:
                     anchor = child << (3 * height) if decoding else codes[children_first[c]]
                     for axis in range(3):
@@ -471,13 +477,13 @@ def _walk(
                     shared += 1
         input, output = output, input
         waiting = new
-    return done == count
+    return CODED if done == count else WRONG_COUNT
 
 
 def _code_tree(
-    data: NDArray[np.uint8], codes: NDArray[np.int64], count: int, depth: int, decoding: bool
+    data: NDArray[np.uint8], codes: NDArray[np.int64], count: int, depth: int, decoding: bool, most_nodes: int
 ) -> tuple[Int, NDArray[np.int64]]:
-    """Bytes of the arithmetic code (-1: not a valid one) and the N Morton codes, in the order of the walk.
+    """Bytes of the arithmetic code (negative: what is wrong) and the N Morton codes, in the order of the walk.
 
     Needs about 70 bytes an anchor, of which a decoder touches only what the data fill.
     """
@@ -503,12 +509,23 @@ def _code_tree(
     ]
     found = np.empty(count, np.int64)
     place = np.empty(half, np.int32)
-    valid = _walk(
-        coder, data, decoding, codes, found, depth, models, level, frontiers[0], frontiers[1], place
+    outcome = _walk(
+        coder,
+        data,
+        decoding,
+        codes,
+        found,
+        depth,
+        models,
+        level,
+        frontiers[0],
+        frontiers[1],
+        place,
+        most_nodes,
     )
     if decoding:
-        return (finish_decoder(coder) if valid else -1), found
-    assert valid, "an octree of sorted, distinct codes is always valid"
+        return (finish_decoder(coder) if outcome == CODED else outcome), found
+    assert outcome == CODED, "an octree of sorted, distinct codes is always valid"
     return finish_encoder(coder, data), found
 
 
@@ -529,20 +546,23 @@ def encode_positions(coordinates: NDArray[np.int32]) -> bytes:
     origin, codes, _ = sorted_morton(coordinates)
     depth = octree_depth(coordinates.astype(np.int64) - origin)
     buffer = np.empty(10 * count + 64, np.uint8)
-    length, _ = _code_tree(buffer, codes, count, depth, decoding=False)
+    any_nodes = count * depth
+    length, _ = _code_tree(buffer, codes, count, depth, False, any_nodes)
     if length > len(buffer):  # never seen; the worst case is far above the usual
         buffer = np.empty(length, np.uint8)
-        length, _ = _code_tree(buffer, codes, count, depth, decoding=False)
+        length, _ = _code_tree(buffer, codes, count, depth, False, any_nodes)
     header = bytes([depth]) + b"".join(signed_varint(int(v) >> ALIGNMENT_BITS) for v in origin)
     payload = header + buffer[:length].tobytes()
     return payload.ljust(_least_bytes(count), b"\0")
 
 
-def decode_positions(data: bytes, count: int) -> NDArray[np.int32]:
+def decode_positions(data: bytes, count: int, most_nodes: int | None = None) -> NDArray[np.int32]:
     """Payload of `count` anchors -> [N, 3] voxel coordinates, in canonical order (ordering/order.py).
 
     Inverse of `encode_positions`. Raises CorruptSection for anything that it would not have written, as far
-    as that can be told. Takes time and memory in proportion to `count`, which the length of the data bounds.
+    as that can be told, and for a walk along more than `most_nodes` nodes. Takes memory in proportion to `count`, which
+    the length of the data bounds, and time in proportion to `count` and the nodes; without `most_nodes` these may be
+    ten times `count`.
     """
     if not 0 <= count <= MAXIMUM_ANCHORS:
         raise CorruptSection(f"anchor positions: {count} anchors, expected 0 to {MAXIMUM_ANCHORS}")
@@ -559,7 +579,12 @@ def decode_positions(data: bytes, count: int) -> NDArray[np.int32]:
     body = np.frombuffer(
         data, np.uint8, offset=start
     ).copy()  # writable: the kernel has one type for both ways
-    length, codes = _code_tree(body, np.empty(0, np.int64), count, depth, decoding=True)
+    most_nodes = count * depth if most_nodes is None else most_nodes
+    length, codes = _code_tree(body, np.empty(0, np.int64), count, depth, True, most_nodes)
+    if length == TOO_MANY_NODES:
+        raise CorruptSection(
+            f"anchor positions: more than {most_nodes} nodes of the octree, the most for this file"
+        )
     padded = len(data) == _least_bytes(count) and not body[max(length, 0) :].any()
     if length < 0 or length > len(body) or (length < len(body) and not padded):
         raise CorruptSection(

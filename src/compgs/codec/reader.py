@@ -40,7 +40,16 @@ from compgs.codec.format import (
 )
 from compgs.codec.integer_network import IntegerNetwork
 from compgs.codec.latents import Prior, RangeHead, decode_range, read_head, stream_sizes
-from compgs.codec.limits import HEAD_PRODUCTS, NETWORK_PRODUCTS, SYMBOLS, check_amount, symbols
+from compgs.codec.limits import (
+    FLAGS,
+    HEAD_PRODUCTS,
+    NETWORK_PRODUCTS,
+    NODES,
+    SYMBOLS,
+    check_amount,
+    most,
+    symbols,
+)
 from compgs.codec.mask_coder import decode_masks
 from compgs.codec.octree import decode_positions
 from compgs.codec.sections import SceneSection, decode_metadata, decode_scene, decode_tables
@@ -141,11 +150,12 @@ def read_latents(
     heads_of_ranges = [read_head(FieldReader(r.data, r.name)) for r in ranges]
     anchors = sum(head.anchors for head in heads_of_ranges) if prefix else scene.anchors
     check_amount(SYMBOLS, symbols(d, anchors), len(data), SECTION_NAMES[SCENE])
+    check_amount(FLAGS, scene.anchors * d.coupled_primitives, len(data), SECTION_NAMES[SCENE])
     if any(by_number.get(PADDING, b"")):
         raise CorruptSection(f"{SECTION_NAMES[PADDING]}: expected zero bytes")
     metadata = decode_metadata(by_number[METADATA], SECTION_NAMES[METADATA]) if METADATA in by_number else {}
     coupled = sum(head.coupled for head in heads_of_ranges) if prefix else scene.coupled
-    read_positions = partial(_positions, by_number, scene.anchors)
+    read_positions = partial(_positions, by_number, scene.anchors, most(NODES, len(data)))
     read_others = partial(_others, by_number, scene, version, anchors, coupled, len(data))
     if prefix:  # only the positions prove that there are so many anchors
         coordinates, others = read_positions(), read_others()
@@ -230,9 +240,9 @@ def _others(
     return _Others(viewpoints, _priors(d, iter(networks), iter(tables)), heads, mask)
 
 
-def _positions(sections: dict[int, bytes], anchors: int) -> np.ndarray:  # [N, 3] int32
+def _positions(sections: dict[int, bytes], anchors: int, most_nodes: int) -> np.ndarray:  # [N, 3] int32
     if POSITIONS in sections:
-        return decode_positions(sections[POSITIONS], anchors)
+        return decode_positions(sections[POSITIONS], anchors, most_nodes)
     return decode_positions_tmc3(sections[POSITIONS_GPCC], anchors)
 
 
@@ -313,6 +323,8 @@ def file_info(data: bytes) -> FileInfo:
     by_number = {section.number: section.data for section in sections}
     scene = decode_scene(by_number[SCENE], SECTION_NAMES[SCENE], version_of(data))
     check_amount(SYMBOLS, symbols(scene.dimensions, scene.anchors), len(data), SECTION_NAMES[SCENE])
+    flags = scene.anchors * scene.dimensions.coupled_primitives
+    check_amount(FLAGS, flags, len(data), SECTION_NAMES[SCENE])
     metadata = decode_metadata(by_number[METADATA], SECTION_NAMES[METADATA]) if METADATA in by_number else {}
     names = group_names(scene.dimensions)
     streams = [0] * len(names)

@@ -39,7 +39,7 @@ from compgs.codec.format import (
 )
 from compgs.codec.integer_network import IntegerNetwork, first_rows
 from compgs.codec.latents import encode_range, read_head
-from compgs.codec.limits import least_bytes
+from compgs.codec.limits import least_bytes, least_bytes_of_all
 from compgs.codec.mask_coder import encode_masks
 from compgs.codec.octree import encode_positions
 from compgs.codec.rows import RowContext, chain_length, steps_of_rows
@@ -243,7 +243,8 @@ def _padding(content: FileContent, before: list[Section], ranges: list[Section])
     is long enough for its content (`codec/limits.py`).
     """
     size = container_bytes(len(before) + len(ranges)) + sum(len(section.data) for section in before)
-    anchors = padding = 0
+    padding = max(0, least_bytes_of_all(content) - size - len(ranges[0].data))
+    anchors = 0
     for section in ranges:
         size += len(section.data)
         anchors += read_head(FieldReader(section.data, section.name)).anchors

@@ -125,6 +125,18 @@ def level_counts(coordinates: NDArray[np.int32]) -> NDArray[np.int64]:
     return np.cumsum(np.bincount(morton_levels(codes, depth), minlength=depth + 1))
 
 
+def walked_nodes(coordinates: NDArray[np.int32]) -> int:
+    """Nodes of the octree that hold two anchors or more, on all levels above the voxels: a coder of positions walks
+    along these.
+    """
+    if len(coordinates) == 0:
+        return 0
+    origin, codes, _ = sorted_morton(coordinates)
+    levels = morton_levels(codes, octree_depth(coordinates.astype(np.int64) - origin)).astype(np.int64)
+    # On level l such a node begins before each anchor that is finer than l, and whose predecessor is not.
+    return int(np.maximum(np.diff(levels), 0).sum())
+
+
 def represented(coordinates: NDArray[np.int32], level: int) -> NDArray[np.int64]:
     """[n]: of the anchors in the prefix of an octree level, how many anchors their nodes of that level hold.
 

@@ -13,13 +13,15 @@ export const ESCAPED = -(2 ** 31);
 export interface Kernels {
   /**
    * Offsets [anchors, 3] in the order of the walk, and the place behind the code's last byte. The code begins at byte
-   * `start`. Throws CorruptSection for another number of anchors, or a code that does not end as it should.
+   * `start`. Throws CorruptSection for another number of anchors, more than `mostNodes` nodes that hold two anchors or
+   * more, or a code that does not end as it should.
    */
   walkOctree(
     payload: Uint8Array,
     start: number,
     anchors: number,
     depth: number,
+    mostNodes: number,
     section: string,
   ): { offsets: Int32Array; end: number };
 

@@ -80,6 +80,7 @@ export class OctreeWalk {
     private readonly decoder: ArithmeticDecoder,
     private readonly anchors: number,
     private readonly depth: number,
+    private readonly mostNodes: number,
     private readonly section: string,
   ) {
     this.offsets = new Int32Array(anchors * 3);
@@ -94,7 +95,12 @@ export class OctreeWalk {
     level.count = 1;
     level.neighbours[13] = 0;
     level.siblings[0] = 1;
-    for (let step = 0; step < this.depth && level.count; step++) level = this.walkLevel(level, step);
+    let nodes = 0;
+    for (let step = 0; step < this.depth && level.count; step++) {
+      nodes += level.count;
+      if (nodes > this.mostNodes) this.refuse(`more than ${this.mostNodes} nodes, the most for this file`);
+      level = this.walkLevel(level, step);
+    }
     if (this.found !== this.anchors) this.refuse(`${this.found} anchors, expected ${this.anchors}`);
     return this.offsets;
   }

@@ -9,9 +9,9 @@ import { OctreeWalk } from "./octree.ts";
 import { decodeChunk } from "./rans.ts";
 
 export const plainKernels: Kernels = {
-  walkOctree(payload, start, anchors, depth, section) {
+  walkOctree(payload, start, anchors, depth, mostNodes, section) {
     const decoder = new ArithmeticDecoder(payload, start);
-    const offsets = new OctreeWalk(decoder, anchors, depth, section).run();
+    const offsets = new OctreeWalk(decoder, anchors, depth, mostNodes, section).run();
     checkEnd(decoder, section);
     return { offsets, end: decoder.end };
   },

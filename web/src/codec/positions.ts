@@ -19,6 +19,7 @@ export interface Positions {
 export function readPositions(
   payload: Uint8Array,
   anchors: number,
+  mostNodes: number,
   name: string,
   kernels: Kernels,
 ): Positions {
@@ -32,7 +33,7 @@ export function readPositions(
   if (anchors > 8 ** depth) reader.refuse(`${anchors} anchors do not fit into an octree of depth ${depth}`);
   const component = () => ORIGIN_UNIT * reader.signedVarint("origin", -Infinity, Infinity, MAX_ORIGIN_BYTES);
   const origin: [number, number, number] = [component(), component(), component()];
-  const { offsets, end } = kernels.walkOctree(payload, reader.position, anchors, depth, name);
+  const { offsets, end } = kernels.walkOctree(payload, reader.position, anchors, depth, mostNodes, name);
   checkPadding(reader, end, least);
   checkFrame(reader, offsets, origin, depth);
   return { depth, origin, offsets };

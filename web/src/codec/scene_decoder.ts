@@ -17,7 +17,7 @@ import {
   readRange,
   readRangeHead,
 } from "./latents.ts";
-import { checkHeadProducts, checkNetworkProducts, checkSymbols } from "./limits.ts";
+import { checkFlags, checkHeadProducts, checkNetworkProducts, checkSymbols, mostNodes } from "./limits.ts";
 import { readMasks } from "./masks.ts";
 import { checkPadding, readMetadata } from "./metadata.ts";
 import { EarlierAnchors } from "./neighbours.ts";
@@ -111,6 +111,7 @@ export class SceneDecoder {
     this.section = readScene(scene!.payload, scene!.name, version);
     const { anchors, coupled, coupledPrimitives, groups } = this.section;
     if (whole) checkSymbols(anchors, groups, bytes);
+    checkFlags(anchors, coupledPrimitives, bytes);
     this.tables = readTables(tables!.payload, groups, tables!.name, kernels);
     const read = readNetworks(networks!.payload, groups, networks!.name, version, kernels);
     this.networks = read.networks;
@@ -124,7 +125,7 @@ export class SceneDecoder {
         "positions (G-PCC): this decoder has no G-PCC; write the file with octree positions",
       );
     }
-    const found = readPositions(positions.payload, anchors, positions.name, kernels);
+    const found = readPositions(positions.payload, anchors, mostNodes(bytes), positions.name, kernels);
     this.depth = found.depth;
     const order = canonicalOrder(found.offsets, found.depth);
     this.offsets = order.offsets;
