@@ -52,7 +52,8 @@ ALLOWED = {
     "tensors": BASE | {"model", "render"},
     "entropy": BASE | {"tensors", "ordering"},
     "losses": BASE | {"tensors"},
-    "metrics": BASE,
+    "lpips": BASE,
+    "metrics": BASE | {"lpips"},
     "stored_weights": BASE | {"model", "entropy"},
     "trained_model": BASE | {"model", "entropy", "tensors", "devices", "stored_weights"},
     "codec": BASE | {"model", "devices", "entropy", "trained_model", "ordering"},
@@ -134,7 +135,7 @@ LOADS = {
     "cli.command": "threads of a training",
     "devices": "CUDA",
     "evaluation.bd_rate": "interpolation",
-    "metrics": "LPIPS",
+    "lpips.network": "LPIPS",
     "numerics.nearest": "a k-d tree",
 }
 

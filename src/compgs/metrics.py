@@ -5,8 +5,9 @@
 - PSNR: of the mean squared error over pixels and channels, data range 255; identical images give infinity.
 - SSIM: 11 x 11 Gaussian window, sigma 1.5, zeros outside the image, data range 1, C1 = 0.01^2, C2 = 0.03^2,
   mean over pixels and channels: the one of 3DGS (`compgs.numerics.ssim`).
-- LPIPS: network "vgg" as in 3DGS unless "alex" is asked for, version 0.1 through torchmetrics, inputs in
-  [-1, 1]. The releases of 3DGS and CompGS feed [0, 1]: their figures are not comparable.
+- LPIPS: version 0.1 on VGG16 (`compgs.lpips`), in both conventions that are in use: `lpips` gives the network images
+  in [-1, 1], as it is meant; `lpips_3dgs` gives it [0, 1], as the releases of 3DGS and CompGS do. The second is what
+  tables of Gaussian splatting have; the two do not compare.
 - FLIP: what people see of the difference when the two images take turns on a screen, by a model of their eyes; no
   learned weights. NVIDIA's implementation, of images of low dynamic range, seen at 67 pixels a degree (its default: a
   screen of 3 840 pixels on 0.7 m, from as far away); mean over the pixels, 0 to 1, less is better.
@@ -21,27 +22,31 @@ A metric over views is the mean of the views' metrics.
 import functools
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import numpy as np
 
-from compgs.errors import MissingDependency, install_line
+from compgs.errors import Unavailable, install_line
+from compgs.lpips import LpipsDistances, LpipsNetwork, lpips_network
 from compgs.numerics.ssim import l1_and_ssim
 
-if TYPE_CHECKING:
-    from torch import Tensor
+__all__ = [
+    "LpipsDistances",
+    "LpipsNetwork",
+    "Unavailable",
+    "check_flip",
+    "flip",
+    "lpips",
+    "lpips_network",
+    "mean_psnr",
+    "psnr",
+    "ssim",
+    "to_8bit",
+]
 
 PIXELS_A_DEGREE = 67.0206  # of FLIP
 SAME_PICTURE = 100.0  # dB, about what one level in one pixel of one channel comes to
-
-# Distance of two batches [1, 3, H, W] in [-1, 1], of torch tensors.
-LpipsNetwork = Callable[[Any, Any], Any]
-
-
-class Unavailable(MissingDependency):
-    """A metric that cannot be computed here; the message is the reason, for reports to print."""
 
 
 def to_8bit(image: np.ndarray) -> np.ndarray:
@@ -117,49 +122,21 @@ def _flip_evaluate() -> Callable[..., Any]:
 
 
 def lpips(
-    a: np.ndarray,
-    b: np.ndarray,
-    network: LpipsNetwork | Literal["vgg", "alex"] = "vgg",
-    mask: np.ndarray | None = None,
-) -> float:
-    """Learned perceptual distance (Zhang et al. 2018) of uint8 images [H, W, 3]; 0 for identical images.
+    a: np.ndarray, b: np.ndarray, network: LpipsNetwork | None = None, mask: np.ndarray | None = None
+) -> LpipsDistances:
+    """Learned perceptual distances (Zhang et al. 2018) of uint8 images [H, W, 3] in both conventions; 0 if identical.
 
-    Raises Unavailable where the package or the network's weights are missing; nothing is downloaded.
+    `network`: of `lpips_network`, which takes a file of weights and a device; None: the weights that are installed.
+    Raises Unavailable where torch or the weights are missing; nothing is downloaded.
     """
     _check(a, b, mask)
-    if mask is not None:
-        black = mask[:, :, None].astype(np.uint8)
-        return lpips(a * black, b * black, network) / float(mask.mean())
-    distance = lpips_network(network) if isinstance(network, str) else network
-    import torch
-
-    inputs = [torch.tensor(image).permute(2, 0, 1)[None].float() / 127.5 - 1.0 for image in (a, b)]
-    with torch.no_grad():
-        return float(distance(*inputs))
+    chosen = network or _installed_network()
+    if mask is None:
+        return chosen.distances(a, b)
+    black, share = mask[:, :, None].astype(np.uint8), float(mask.mean())
+    return LpipsDistances(*(distance / share for distance in chosen.distances(a * black, b * black)))
 
 
 @functools.cache
-def lpips_network(name: Literal["vgg", "alex"]) -> LpipsNetwork:
-    """The network with its published weights: torchmetrics, and a backbone in torch's checkpoint folder."""
-    try:
-        import torch
-        import torchvision
-        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-    except (ImportError, RuntimeError) as error:  # a torchvision for another torch fails with RuntimeError
-        raise Unavailable(
-            f"LPIPS needs torch, torchmetrics and torchvision ({error}): {install_line('lpips')}"
-        ) from error
-    models = torchvision.models
-    weights = {"vgg": models.VGG16_Weights, "alex": models.AlexNet_Weights}[name].IMAGENET1K_V1
-    file = Path(torch.hub.get_dir()) / "checkpoints" / weights.url.rsplit("/", 1)[1]
-    if not file.is_file():
-        remedy = f"torchvision.models.{'vgg16' if name == 'vgg' else 'alexnet'}(weights='IMAGENET1K_V1')"
-        raise Unavailable(f"LPIPS needs {file}, which is missing; `{remedy}` in Python downloads it")
-    network = LearnedPerceptualImagePatchSimilarity(net_type=name, normalize=False)
-    network.eval()
-
-    def distance(a: "Tensor", b: "Tensor") -> "Tensor":
-        network.reset()
-        return network(a, b)
-
-    return distance
+def _installed_network() -> LpipsNetwork:
+    return lpips_network()

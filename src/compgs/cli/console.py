@@ -102,6 +102,7 @@ def print_results(results: "Results") -> None:
     table.add_row("SSIM", f"{results.ssim:.4f}")
     if results.lpips is not None:
         table.add_row("LPIPS", f"{results.lpips:.4f}")
+        table.add_row("LPIPS as 3DGS measures it", f"{results.lpips_3dgs:.4f}")
     elif results.lpips_note != "not asked for":
         table.add_row("LPIPS", escape(str(results.lpips_note)))
     if results.flip is not None:
@@ -173,6 +174,10 @@ def print_comparison(found: "Comparison") -> None:
         change = f"{b.psnr - a.psnr:+.2f} dB"
         table.add_row("PSNR, photographs", f"{a.psnr:.2f} dB", f"{b.psnr:.2f} dB", change)
         table.add_row("SSIM, photographs", f"{a.ssim:.4f}", f"{b.ssim:.4f}", f"{b.ssim - a.ssim:+.4f}")
+    for key, name in (("lpips", "LPIPS"), ("lpips_3dgs", "LPIPS as 3DGS measures it")):
+        old, new = getattr(a, key), getattr(b, key)
+        if old is not None and new is not None:
+            table.add_row(f"{name}, photographs", f"{old:.4f}", f"{new:.4f}", f"{new - old:+.4f}")
     table.add_row("decoding", duration(a.decode_seconds), duration(b.decode_seconds))
     table.add_row("rendering a view", duration(a.render_seconds), duration(b.render_seconds))
     console.print(table)

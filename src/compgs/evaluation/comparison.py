@@ -13,6 +13,7 @@
 | identical | every picture of b is equal to that of a |
 | psnr | dB, of b's pictures against a's, mean over the views; equal ones count as 100; null if all are |
 | ssim | of b's pictures against a's, mean over the views |
+| lpips, lpips_3dgs | the same, in both conventions (`compgs.metrics`), or null; `lpips_note` then says why |
 | worst_view, worst_psnr | name of the view in which they differ most; its dB, null if identical |
 | device, threads | where it ran |
 | notes | what was decided, one sentence each |
@@ -25,12 +26,12 @@ Of each file:
 | components | bytes by component; they sum to `bytes` |
 | primitives | that are drawn: coupled primitives or splats |
 | anchors, coupled_primitives, splats | counts, null what the file does not have |
-| psnr, ssim | against the photographs, mean over the views; null without photographs |
+| psnr, ssim, lpips, lpips_3dgs | against the photographs, mean over the views; null without photographs |
 | decode_seconds, render_seconds | file to model, kernels loaded; median over the views |
 
 `per_view.json`: a list in the views' order with `name`, `file` (of the pictures in `a`, `b`, `difference` and `gt`),
-`psnr`, `ssim` (of b against a), `a_psnr`, `a_ssim`, `b_psnr`, `b_ssim` (against the photograph, or null) and
-`difference_scale`: levels, of 255, at which `difference` is white.
+`psnr`, `ssim`, `lpips`, `lpips_3dgs` (of b against a), the same with `a_` and `b_` before it (of each against the
+photograph, or null) and `difference_scale`: levels, of 255, at which `difference` is white.
 """
 
 import dataclasses
@@ -50,7 +51,7 @@ from compgs.cameras import Camera
 from compgs.devices import chosen_device, device_name
 from compgs.errors import SceneError, UnsupportedCamera
 from compgs.evaluation.camera_path import camera_entry, read_cameras, surround
-from compgs.evaluation.measure import encode_png, timed_decode, timed_render
+from compgs.evaluation.measure import encode_png, lpips_or_why_not, timed_decode, timed_render
 from compgs.evaluation.reports.comparison_page import ComparisonPage
 from compgs.evaluation.reports.pictures import difference_picture, levels_between, scale_for
 from compgs.formats import check_scene, component_bytes, format_of, scene_file, scene_name
@@ -88,6 +89,8 @@ class ComparedFile:
     splats: int | None
     psnr: float | None  # dB, against the photographs
     ssim: float | None
+    lpips: float | None
+    lpips_3dgs: float | None
     decode_seconds: float
     render_seconds: float
 
@@ -100,10 +103,16 @@ class ComparedView:
     file: str  # of the pictures in a, b, difference and gt
     psnr: float  # dB, of b's picture against a's; infinite if they are equal
     ssim: float
+    lpips: float | None
+    lpips_3dgs: float | None
     a_psnr: float | None  # dB, against the photograph
     a_ssim: float | None
+    a_lpips: float | None
+    a_lpips_3dgs: float | None
     b_psnr: float | None
     b_ssim: float | None
+    b_lpips: float | None
+    b_lpips_3dgs: float | None
     difference_scale: int  # levels, of 255, at which the picture of the difference is white
 
 
@@ -120,6 +129,7 @@ class Comparison:
     height: int  # pixels
     device: str
     threads: int
+    lpips_note: str | None  # why there is no LPIPS
     notes: tuple[str, ...]
     per_view: tuple[ComparedView, ...]
 
@@ -132,6 +142,16 @@ class Comparison:
     def ssim(self) -> float:
         """Of b against a."""
         return fmean(view.ssim for view in self.per_view)
+
+    @property
+    def lpips(self) -> float | None:
+        """Of b against a, images given in [-1, 1]."""
+        return _mean([view.lpips for view in self.per_view])
+
+    @property
+    def lpips_3dgs(self) -> float | None:
+        """Of b against a, images given in [0, 1]."""
+        return _mean([view.lpips_3dgs for view in self.per_view])
 
     @property
     def identical(self) -> bool:
@@ -158,9 +178,14 @@ class Comparison:
             if equal
             else ""
         )
+        perceived = (
+            ""
+            if self.lpips is None
+            else f", LPIPS {self.lpips:.4f} (as 3DGS measures it {self.lpips_3dgs:.4f})"
+        )
         return [
-            f"{self.b.file} against {self.a.file}: PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}, mean of {of_views} "
-            f"({size}).{also}",
+            f"{self.b.file} against {self.a.file}: PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}{perceived}, mean of "
+            f"{of_views} ({size}).{also}",
             f"They differ most in {self.worst.name}: {self.worst.psnr:.2f} dB.",
         ]
 
@@ -179,6 +204,9 @@ class Comparison:
             "identical": self.identical,
             "psnr": self.psnr,
             "ssim": self.ssim,
+            "lpips": self.lpips,
+            "lpips_3dgs": self.lpips_3dgs,
+            "lpips_note": self.lpips_note,
             "worst_view": self.worst.name,
             "worst_psnr": self.worst.psnr,
             "device": self.device,
@@ -200,6 +228,7 @@ def compare(
     background: Background | None = None,
     output: str | Path | None = None,
     overwrite: bool = False,
+    lpips: bool | str | Path = False,
     device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
@@ -212,7 +241,7 @@ def compare(
     `background`, RGB, 0 to 1: behind both; by default that of the scene, of a .cgs file, or black. With a scene, a
     .cgs file keeps its own, as in an evaluation. With `output`, a folder, `results.json` and `per_view.json` (their
     schema: `compgs.evaluation.comparison`), `cameras.json`, the pictures (`a`, `b`, `difference`, `gt`) and
-    `comparison.html` are written there. `progress(done, total)` is called after each view.
+    `comparison.html` are written there. `lpips`: as in `evaluate`. `progress(done, total)` is called after each view.
 
     Raises BitstreamError, SplatFileError, SceneError, OutputError.
     """
@@ -228,7 +257,7 @@ def compare(
     sides, notes = _opened(paths, chosen, read, background)
     places, origin = _places(sides, read, cameras)
     if output is None:
-        return _compared(sides, places, origin, read, notes, chosen, progress)
+        return _compared(sides, places, origin, read, notes, chosen, lpips, progress)
     with filling(Path(output)) as folder:
         page = ComparisonPage(scene_name(paths[0]), scene_name(paths[1]))
 
@@ -237,7 +266,7 @@ def compare(
                 write_bytes(folder / name / row.file, encode_png(picture))
             page.keep(row, pictures)
 
-        found = _compared(sides, places, origin, read, notes, chosen, progress, keep)
+        found = _compared(sides, places, origin, read, notes, chosen, lpips, progress, keep)
         write_json(folder / "cameras.json", [camera_entry(place.camera, place.name) for place in places])
         write_json(folder / "per_view.json", found.per_view_list())
         write_json(folder / "results.json", found.to_dict())
@@ -335,12 +364,14 @@ def _compared(
     scene: Scene | None,
     notes: tuple[str, ...],
     device: str,
+    lpips: bool | str | Path,
     progress: Callable[[int, int], None] | None,
     keep: Callable[[ComparedView, dict[str, np.ndarray]], None] | None = None,
 ) -> Comparison:
     """`keep` is given each view and its pictures: a, b, difference and, where there is one, the photograph as gt."""
     for side in sides:
         timed_render(side.model, places[0].camera)  # caches are filled: not what a view costs
+    network, lpips_note = lpips_or_why_not(lpips, device)
     rows: list[ComparedView] = []
     seconds: list[list[float]] = []
     for i, place in enumerate(places):
@@ -348,18 +379,18 @@ def _compared(
         photograph = None if place.view is None else place.view.image
         levels = levels_between(a, b)
         scale = scale_for([levels])
-        a_psnr, a_ssim = _quality(a, photograph)
-        b_psnr, b_ssim = _quality(b, photograph)
+        a_quality, b_quality = (_quality(image, photograph, network) for image in (a, b))
+        between = None if network is None else metrics.lpips(b, a, network)
         rows.append(
             ComparedView(
                 name=place.name,
                 file=f"{i:05d}.png",
                 psnr=metrics.psnr(a, b),
                 ssim=metrics.ssim(b, a),
-                a_psnr=a_psnr,
-                a_ssim=a_ssim,
-                b_psnr=b_psnr,
-                b_ssim=b_ssim,
+                lpips=None if between is None else between.lpips,
+                lpips_3dgs=None if between is None else between.lpips_3dgs,
+                **{f"a_{name}": value for name, value in a_quality.items()},
+                **{f"b_{name}": value for name, value in b_quality.items()},
                 difference_scale=scale,
             )
         )
@@ -371,32 +402,39 @@ def _compared(
             progress(i + 1, len(places))
     return Comparison(
         compgs=__version__,
-        a=_described(sides[0], [row.a_psnr for row in rows], [row.a_ssim for row in rows], seconds, 0),
-        b=_described(sides[1], [row.b_psnr for row in rows], [row.b_ssim for row in rows], seconds, 1),
+        a=_described(sides[0], "a", rows, [pair[0] for pair in seconds]),
+        b=_described(sides[1], "b", rows, [pair[1] for pair in seconds]),
         scene=scene.name if scene else None,
         cameras=origin,
         width=places[0].camera.width,
         height=places[0].camera.height,
         device=device_name(device),
         threads=numba.get_num_threads(),
+        lpips_note=lpips_note,
         notes=notes,
         per_view=tuple(rows),
     )
 
 
-def _quality(image: np.ndarray, photograph: np.ndarray | None) -> tuple[float | None, float | None]:
-    """PSNR and SSIM against the photograph, where there is one."""
+QUALITY = ("psnr", "ssim", "lpips", "lpips_3dgs")  # against the photographs
+
+
+def _quality(
+    image: np.ndarray, photograph: np.ndarray | None, network: metrics.LpipsNetwork | None
+) -> dict[str, float | None]:
+    """Against the photograph, where there is one; LPIPS, where there is a network."""
     if photograph is None:
-        return None, None
-    return metrics.psnr(image, photograph), metrics.ssim(image, photograph)
+        return dict.fromkeys(QUALITY)
+    distances = (None, None) if network is None else metrics.lpips(image, photograph, network)
+    values = (metrics.psnr(image, photograph), metrics.ssim(image, photograph), *distances)
+    return dict(zip(QUALITY, values, strict=True))
 
 
 def _described(
     side: _Side,
-    psnr: Sequence[float | None],
-    ssim: Sequence[float | None],
-    seconds: Sequence[Sequence[float]],
-    index: int,
+    name: str,  # "a" or "b"
+    rows: Sequence[ComparedView],
+    seconds: Sequence[float],
 ) -> ComparedFile:
     components = component_bytes(side.path)
     counts = side.model.counts
@@ -410,10 +448,9 @@ def _described(
         anchors=counts.get("anchors"),
         coupled_primitives=counts.get("coupled_primitives"),
         splats=counts.get("splats"),
-        psnr=_mean(psnr),
-        ssim=_mean(ssim),
+        **{key: _mean([getattr(row, f"{name}_{key}") for row in rows]) for key in QUALITY},
         decode_seconds=side.decode_seconds,
-        render_seconds=median(pair[index] for pair in seconds),
+        render_seconds=median(seconds),
     )
 
 

@@ -38,7 +38,7 @@ def evaluate(
     *,
     output: str | Path | None = None,
     overwrite: bool = False,
-    lpips: bool = False,
+    lpips: bool | str | Path = False,
     flip: bool = False,
     device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
@@ -52,7 +52,8 @@ def evaluate(
     does. With `output`, a folder, `results.json` and `per_view.json` (their schema: `compgs.evaluation.results`),
     `cameras.json` (of the held-out views), `test/renders`, `test/gt`, `test/masks` (of views that have one: white where
     a pixel counts) and `contact_sheet.png` are written there.
-    `progress(done, total)` is called after each view; `method` is noted: which one wrote the file. Where the file tells
+    `lpips`: a path is that of the weights, else they are those that are installed. `progress(done, total)` is called
+    after each view; `method` is noted: which one wrote the file. Where the file tells
     that it was made from another scene, or from views or sizes of images other than these, `notes` of the results say
     so. `truth`: what the views' images are, as the contact sheet calls them.
 
@@ -79,7 +80,7 @@ def evaluate(
     timed_render(
         model, scene.test_views[0].camera
     )  # kernels are loaded and caches filled: not what a view costs
-    lpips_note: str | None = None if lpips else "not asked for"
+    network, lpips_note = lpips_or_why_not(lpips, chosen)
     rows: list[ViewResult] = []
     images: list[np.ndarray] = []
     for i, view in enumerate(scene.test_views):
@@ -87,10 +88,10 @@ def evaluate(
         if exposure:
             image = exposed_by_left_half(image, view.image, view.mask)
         seen, photograph, mask = compared(image, view, exposure)
-        distance: float | None = None
-        if lpips_note is None:
+        distances: metrics.LpipsDistances | None = None
+        if network is not None and lpips_note is None:
             try:
-                distance = metrics.lpips(seen, photograph, mask=mask)
+                distances = metrics.lpips(seen, photograph, network, mask)
             except metrics.Unavailable as reason:
                 lpips_note = f"unavailable: {reason}"
         rows.append(
@@ -99,7 +100,8 @@ def evaluate(
                 file=f"{i:05d}.png",
                 psnr=metrics.psnr(seen, photograph, mask),
                 ssim=metrics.ssim(seen, photograph, mask),
-                lpips=distance,
+                lpips=None if distances is None else distances.lpips,
+                lpips_3dgs=None if distances is None else distances.lpips_3dgs,
                 render_seconds=seconds,
                 flip=metrics.flip(seen, photograph, mask) if flip else None,
             )
@@ -132,6 +134,18 @@ def evaluate(
     if output is not None:
         write_evaluation(Path(output), results, scene.test_views, images, truth)
     return results
+
+
+def lpips_or_why_not(
+    wanted: bool | str | Path, device: str
+) -> tuple[metrics.LpipsNetwork | None, str | None]:
+    """The network, or why there is none."""
+    if wanted is False:
+        return None, "not asked for"
+    try:
+        return metrics.lpips_network(None if wanted is True else wanted, device), None
+    except metrics.Unavailable as reason:
+        return None, f"unavailable: {reason}"
 
 
 def compared(

@@ -11,7 +11,8 @@
 | views, width, height | number of held-out views; pixels of the first |
 | psnr | dB, mean over the views; null if infinite: all renderings are perfect |
 | ssim | mean over the views |
-| lpips | mean over the views, or null; `lpips_note` then says why |
+| lpips | on VGG16, images given to it in [-1, 1]: mean over the views, or null; `lpips_note` then says why |
+| lpips_3dgs | the same, images given in [0, 1] as the release of 3DGS does: what its field's tables have |
 | flip | mean over the views, or null: it was not asked for |
 | bytes | of the whole file, or of all files of a scene in tiles |
 | components | bytes by component of the file; they sum to `bytes` |
@@ -25,7 +26,7 @@
 | notes | sentences: in what the scene is not what the file was trained on, as far as the file's cameras tell |
 
 `per_view.json`: a list in the views' order with `name`, `file` (of `test/renders` and `test/gt`), `psnr`,
-`ssim`, `lpips`, `flip`, `render_seconds`.
+`ssim`, `lpips`, `lpips_3dgs`, `flip`, `render_seconds`.
 """
 
 import dataclasses
@@ -44,9 +45,10 @@ class ViewResult:
     file: str  # of the image in test/renders and test/gt
     psnr: float  # dB
     ssim: float
-    lpips: float | None
+    lpips: float | None  # images given in [-1, 1]
     render_seconds: float
     flip: float | None = None
+    lpips_3dgs: float | None = None  # images given in [0, 1]
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,11 @@ class Results:
         return fmean(values) if len(values) == len(self.per_view) else None
 
     @property
+    def lpips_3dgs(self) -> float | None:
+        values = [view.lpips_3dgs for view in self.per_view if view.lpips_3dgs is not None]
+        return fmean(values) if len(values) == len(self.per_view) else None
+
+    @property
     def flip(self) -> float | None:
         values = [view.flip for view in self.per_view if view.flip is not None]
         return fmean(values) if len(values) == len(self.per_view) else None
@@ -126,6 +133,7 @@ class Results:
             "psnr": self.psnr,
             "ssim": self.ssim,
             "lpips": self.lpips,
+            "lpips_3dgs": self.lpips_3dgs,
             "lpips_note": self.lpips_note,
             "flip": self.flip,
             "bytes": self.bytes,

@@ -1,6 +1,6 @@
 """A suite from its file to its tables."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from compgs.suites.cluster import Needs, check_ray, run_on_cluster
 from compgs.suites.jobs import Job, Outcome, check_scenes, jobs_of
 from compgs.suites.results import write_results
 from compgs.suites.serial import run_serially
-from compgs.suites.suite import Suite
+from compgs.suites.suite import SetValue, Suite
 
 
 @dataclass(frozen=True)
@@ -89,15 +89,23 @@ def measurable(suite: Suite) -> tuple[Suite, list[str]]:
     from compgs.metrics import check_flip, lpips_network
 
     notes = []
-    for name, check in (("lpips", lambda: lpips_network("vgg")), ("flip", check_flip)):
-        if not suite.train.get(name):
+    weights = suite.train.get("lpips_weights")
+    for name, check in (
+        ("lpips", lambda: lpips_network(None if weights is None else str(weights))),
+        ("flip", check_flip),
+    ):
+        if not (suite.train.get(name) or (name == "lpips" and weights)):
             continue
         try:
             check()
         except CompGSError as reason:
-            suite = replace(suite, train={key: value for key, value in suite.train.items() if key != name})
+            suite = replace(suite, train=_without(name, suite.train))
             notes.append(f"{name.upper()} is unavailable: {reason}")
     return suite, notes
+
+
+def _without(name: str, options: Mapping[str, SetValue]) -> dict[str, SetValue]:
+    return {key: value for key, value in options.items() if key.removesuffix("_weights") != name}
 
 
 def in_words(job: Job) -> str:

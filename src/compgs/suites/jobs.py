@@ -159,9 +159,10 @@ def _job(
 
 
 def _option(name: str, value: SetValue) -> Iterable[str]:
+    option = f"--{name.replace('_', '-')}"
     if isinstance(value, bool):
-        return [f"--{name}"] if value else []
-    return [f"--{name}", _word(value)]
+        return [option] if value else []
+    return [option, _word(value)]
 
 
 def _word(value: SetValue) -> str:

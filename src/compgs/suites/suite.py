@@ -25,7 +25,7 @@ method = "CompGS (paper)"
 rate = "lambda 0.001"
 psnr = 23.70
 ssim = 0.84
-lpips = 0.21
+lpips_3dgs = 0.21                         # images in [0, 1], as nearly everybody publishes; lpips: in [-1, 1]
 bytes = 10_070_163
 source = "Liu et al. 2024, Table 1"
 """
@@ -93,7 +93,8 @@ class PublishedRow:
     rate: str = ""
     psnr: float | None = None
     ssim: float | None = None
-    lpips: float | None = None
+    lpips: float | None = None  # images given in [-1, 1]
+    lpips_3dgs: float | None = None  # images given in [0, 1], as the release of 3DGS does
     bytes: float | None = None
 
 
@@ -111,7 +112,7 @@ class Suite:
 
 
 # Options of `compgs train` that a suite may give to every run; all else is a setting.
-TRAIN_OPTIONS = ("steps", "threads", "device", "lpips", "flip")
+TRAIN_OPTIONS = ("steps", "threads", "device", "lpips", "lpips_weights", "flip")
 
 
 def load_suite(name: str | Path) -> Suite:

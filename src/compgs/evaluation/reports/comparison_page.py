@@ -108,6 +108,8 @@ def files_table(found: "Comparison", a: str, b: str) -> Table:
         Column("anchors", "anchors", ",.0f"),
         Column("psnr", "PSNR against photographs, dB", ".2f"),
         Column("ssim", "SSIM", ".4f"),
+        Column("lpips", "LPIPS", ".4f"),
+        Column("lpips_3dgs", "LPIPS as 3DGS", ".4f"),
         Column("decode_seconds", "decoding, s", ".3f"),
         Column("render_seconds", "a view, s", ".4f"),
     )
@@ -120,6 +122,8 @@ def files_table(found: "Comparison", a: str, b: str) -> Table:
             f.anchors,
             f.psnr,
             f.ssim,
+            f.lpips,
+            f.lpips_3dgs,
             f.decode_seconds,
             f.render_seconds,
         )
@@ -135,13 +139,16 @@ def views_table(found: "Comparison", a: str, b: str) -> Table:
         Column("view", "view"),
         Column("psnr", "each other, PSNR, dB", ".2f"),
         Column("ssim", "SSIM", ".4f"),
+        Column("lpips", "LPIPS", ".4f"),
         Column("a_psnr", f"{a}, PSNR, dB", ".2f"),
         Column("a_ssim", "SSIM", ".4f"),
+        Column("a_lpips", "LPIPS", ".4f"),
         Column("b_psnr", f"{b}, PSNR, dB", ".2f"),
         Column("b_ssim", "SSIM", ".4f"),
+        Column("b_lpips", "LPIPS", ".4f"),
     )
     rows = tuple(
-        (view.name, view.psnr, view.ssim, view.a_psnr, view.a_ssim, view.b_psnr, view.b_ssim)
+        tuple(getattr(view, column.key if column.key != "view" else "name") for column in columns)
         for view in sorted(found.per_view, key=lambda view: view.psnr)
     )
     return Table("views", "Views", columns, rows).without_empty_columns()

@@ -12,7 +12,7 @@ from compgs.evaluation.reports.tables import Column, Spread, Table, Value
 
 PLAIN_3DGS = "3dgs"  # method that sizes are compared with
 # Numbers that seeds change; of the others the mean says enough.
-WITH_SPREAD = ("psnr", "ssim", "lpips", "flip", "bytes")
+WITH_SPREAD = ("psnr", "ssim", "lpips", "lpips_3dgs", "flip", "bytes")
 ALL_SCENES = "mean of all scenes"
 
 
@@ -30,8 +30,10 @@ class Measure:
 MEASURES = (
     Measure("psnr", "PSNR", ".2f", ", dB"),
     Measure("ssim", "SSIM", ".4f"),
+    Measure("lpips", "LPIPS", ".4f", sign=-1),
     Measure("flip", "FLIP", ".4f", sign=-1),
 )
+ALWAYS = ("psnr", "ssim")  # in every evaluation
 
 NAMES = (Column("scene", "scene"), Column("method", "method"), Column("rate", "rate"))
 NUMBERS = (
@@ -39,6 +41,7 @@ NUMBERS = (
     Column("psnr", "PSNR, dB", ".2f"),
     Column("ssim", "SSIM", ".4f"),
     Column("lpips", "LPIPS", ".4f"),
+    Column("lpips_3dgs", "LPIPS as 3DGS", ".4f"),
     Column("flip", "FLIP", ".4f"),
     Column("bytes", "bytes", ",.0f"),
     Column("ratio", "3DGS / bytes", ".1f"),
@@ -114,7 +117,9 @@ def methods(of: Sequence[Run] | Sequence[Point]) -> list[str]:
 
 def measured(points: Sequence[Point]) -> tuple[Measure, ...]:
     """PSNR, SSIM, and what else all points know."""
-    return tuple(m for m in MEASURES if m.key != "flip" or all(p.mean(m.key) is not None for p in points))
+    return tuple(
+        m for m in MEASURES if m.key in ALWAYS or all(point.mean(m.key) is not None for point in points)
+    )
 
 
 def means_table(points: Sequence[Point], count: int | None = None) -> Table | None:
@@ -267,13 +272,15 @@ def components(point: Point) -> dict[str, float]:
 
 
 def views_table(points: Sequence[Point]) -> Table:
-    """PSNR, SSIM and FLIP of every view, means over the seeds; of each scene the worst view first."""
+    """PSNR, SSIM, LPIPS and FLIP of every view, means over the seeds; of each scene the worst view first."""
     columns = (
         Column("scene", "scene"),
         Column("view", "view"),
         *NAMES[1:],
         Column("psnr", "PSNR, dB", ".2f"),
         Column("ssim", "SSIM", ".4f"),
+        Column("lpips", "LPIPS", ".4f"),
+        Column("lpips_3dgs", "LPIPS as 3DGS", ".4f"),
         Column("flip", "FLIP", ".4f"),
     )
     rows: list[tuple[Value, ...]] = []
@@ -284,8 +291,10 @@ def views_table(points: Sequence[Point]) -> Table:
                 found = [each for run in point.runs for each in run.per_view if each.get("name") == view]
                 if found:
                     values = (fmean(psnr(each) for each in found), fmean(each["ssim"] for each in found))
-                    flip = _mean([each.get("flip") for each in found])
-                    rows.append((scene, view, point.method, point.rate or None, *values, flip))
+                    more = (
+                        _mean([each.get(key) for each in found]) for key in ("lpips", "lpips_3dgs", "flip")
+                    )
+                    rows.append((scene, view, point.method, point.rate or None, *values, *more))
     return Table("views", "Views", columns, tuple(rows)).without_empty_columns()
 
 
