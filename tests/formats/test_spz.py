@@ -19,11 +19,11 @@ try:
 except ImportError:
     zstandard = None  # type: ignore[assignment]
 
-VERSIONS = [
-    2,
+WRITTEN_VERSIONS = [
     3,
     pytest.param(4, marks=pytest.mark.skipif(zstandard is None, reason="zstandard is not installed")),
 ]
+VERSIONS = [1, 2, *WRITTEN_VERSIONS]
 # One splat, degree 1, 12 fractional bits; axes right, up, back. Position (1, -0.5, 2), opacity 51/255 = 0.2,
 # color bytes, log scales (16/16 - 10, ...), rotation of 3: w largest, and coefficients 128 + (0 ... 8).
 COLUMNS = {
@@ -35,11 +35,13 @@ COLUMNS = {
     "rotations": struct.pack("<I", 3 << 30 | 128 << 20 | (1 << 9 | 256) << 10 | 0),
     "harmonics": bytes(range(128, 137)),
 }
-SHORT_ROTATION = bytes([191, 64, 128])  # version 2: x, y, z = byte / 127.5 - 1
+SHORT_ROTATION = bytes([191, 64, 128])  # versions 1 and 2: x, y, z = byte / 127.5 - 1
+HALF_POSITION = struct.pack("<3e", 1, -0.5, 2)  # version 1
 
 
 def by_hand(version: int) -> bytes:
-    columns = {**COLUMNS, "rotations": SHORT_ROTATION} if version == 2 else COLUMNS
+    columns = {**COLUMNS, "rotations": SHORT_ROTATION} if version <= 2 else COLUMNS
+    columns = {**columns, "positions": HALF_POSITION} if version == 1 else columns
     start = b"NGSP" + struct.pack("<IIBBBB", version, 1, 1, 12, 0, 6 if version == 4 else 0)
     if version < 4:
         return gzip.compress(start + b"".join(columns.values()))
@@ -60,7 +62,7 @@ def test_a_file_made_by_hand_holds_the_splat_it_describes(tmp_path: Path, versio
     np.testing.assert_array_equal(splat.log_scales, [[-9, -5, 0]])
     np.testing.assert_allclose(splat.opacities, [0.2], atol=1e-6)
     np.testing.assert_allclose(splat.dc, np.array([[-0.5, 0.5, -0.1]]) / 0.15, atol=1e-6)
-    if version == 2:
+    if version <= 2:
         x, y, z = 191 / 127.5 - 1, 64 / 127.5 - 1, 128 / 127.5 - 1
     else:
         x, y, z = 128 / 511 / 2**0.5, -256 / 511 / 2**0.5, 0
@@ -72,7 +74,7 @@ def test_a_file_made_by_hand_holds_the_splat_it_describes(tmp_path: Path, versio
     assert sum(spz.component_bytes(path).values()) == path.stat().st_size
 
 
-@pytest.mark.parametrize("version", VERSIONS[1:])
+@pytest.mark.parametrize("version", WRITTEN_VERSIONS)
 @pytest.mark.parametrize("degree", range(4))
 def test_a_round_trip_is_off_by_half_a_step_at_most(made, tmp_path: Path, version: int, degree: int) -> None:
     arrays = made(500, degree)
@@ -134,6 +136,37 @@ def test_version_4_without_zstandard_names_the_remedy(made, monkeypatch: pytest.
     assert spz.encoded(made(2), 3)
 
 
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_the_same_without_gzip_holds_the_same_splat(tmp_path: Path, version: int) -> None:
+    packed, raw = tmp_path / "packed.spz", tmp_path / "raw.spz"
+    packed.write_bytes(by_hand(version))
+    raw.write_bytes(gzip.decompress(by_hand(version)))
+    assert spz.begins(raw.read_bytes())
+    one, other = spz.read(packed), spz.read(raw)
+    for name, values in vars(one).items():
+        assert np.array_equal(values, getattr(other, name)), name
+    assert spz.component_bytes(raw) == {"splats": raw.stat().st_size}
+    for damaged in (raw.read_bytes()[:-1], raw.read_bytes() + b"x"):
+        raw.write_bytes(damaged)
+        with pytest.raises(SplatFileError, match=r"1 splats are .* copy it again"):
+            spz.read(raw)
+
+
+def test_of_harmonics_of_degree_4_those_up_to_3_are_kept(made, tmp_path: Path) -> None:
+    """Coefficient by coefficient: the nine of degree 4 are the last 27 bytes of a splat."""
+    path = tmp_path / "a.spz"
+    content = gzip.decompress(spz.encoded(made(6, 3)))
+    path.write_bytes(gzip.compress(content))
+    three = spz.read(path)
+    splats, harmonics = content[: -6 * 45], np.frombuffer(content[-6 * 45 :], np.uint8).reshape(6, 45)
+    longer = np.hstack([harmonics, np.full((6, 27), 255, np.uint8)])
+    path.write_bytes(gzip.compress(splats[:12] + b"\x04" + splats[13:] + longer.tobytes()))
+    four = spz.read(path)
+    assert four.degree == 3
+    for name, values in vars(three).items():
+        assert np.array_equal(values, getattr(four, name)), name
+
+
 def unpacked(change: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
     return lambda data: gzip.compress(change(gzip.decompress(data)))
 
@@ -149,13 +182,14 @@ def at(position: int, value: bytes) -> Callable[[bytes], bytes]:
         (lambda data: data[:-12], "damaged|unpacked, the file holds"),
         (lambda data: data + b"more", "copy it again"),
         (lambda data: data[:20] + bytes([data[20] ^ 255]) + data[21:], "a.spz"),
-        (unpacked(at(4, b"\x01")), "version 1 inside gzip"),
+        (unpacked(at(4, b"\x00")), "version 0 inside gzip"),
+        (unpacked(at(4, b"\x01")), "40 splats are"),
         (unpacked(at(4, b"\x04")), "version 4 inside gzip"),
         (unpacked(at(8, struct.pack("<I", 41))), "41 splats are"),
         (unpacked(at(8, struct.pack("<I", 39))), "39 splats are"),
         (unpacked(at(8, struct.pack("<I", 0))), "holds no splats"),
         (unpacked(at(8, struct.pack("<I", 1 << 31))), "promises 2147483648 splats"),
-        (unpacked(at(12, b"\x04")), "degree 4"),
+        (unpacked(at(12, b"\x05")), "degree 5"),
         (unpacked(at(13, b"\x19")), "25 fractional bits"),
         (unpacked(lambda data: data + bytes(1 << 16)), "the file holds more than"),
     ],
@@ -192,7 +226,8 @@ def test_extensions_after_the_splats_are_skipped(made, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (at(4, struct.pack("<I", 3)), "version 3 outside gzip"),
+        (at(4, struct.pack("<I", 3)), "40 splats are 2616 bytes unpacked"),
+        (at(4, struct.pack("<I", 5)), "version 5 outside gzip"),
         (at(8, struct.pack("<I", 41)), "positions: 360 bytes, expected 369 for 41 splats"),
         (at(15, b"\x05"), "5 columns, expected 6"),
         (at(16, struct.pack("<I", 31)), "byte 31, outside the file"),

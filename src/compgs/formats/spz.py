@@ -1,14 +1,14 @@
 """Splats as an .spz file (Niantic): quantized columns, compressed; about a tenth of a .ply.
 
-    version 2, 3    gzip( header | columns )
+    version 1 to 3  gzip( header | columns ), or the same without gzip
     version 4       header | extensions | table | columns, each a Zstandard frame
 
 | header field | bytes | what |
 |---|---|---|
 | magic | 4 | "NGSP" |
-| version | 4 | 2, 3 or 4 |
+| version | 4 | 1 to 4 |
 | count | 4 | splats |
-| degree | 1 | of the harmonics, 0 to 3 here |
+| degree | 1 | of the harmonics, 0 to 4, of which degree 4 is left out here |
 | fractional bits | 1 | of positions |
 | flags | 1 | 1: trained with antialiasing; 2: extensions are there, which are skipped |
 | streams | 1 | columns in the table; 0 before version 4 |
@@ -17,12 +17,13 @@
 | column | bytes a splat | value |
 |---|---|---|
 | positions | 9 | signed 24 bits / 2^fractional bits |
+| | 6 | version 1: float16 |
 | opacities | 1 | / 255 |
 | colors | 3 | coefficient of degree 0 = (byte / 255 - 1/2) / 0.15 |
 | scales | 3 | log scale = byte / 16 - 10 |
 | rotations | 4 | x-y-z-w without the largest, each a sign and 9 bits of 1/sqrt(2); at the top 2 bits: which |
-| | 3 | version 2: x, y, z = byte / 127.5 - 1, w >= 0 |
-| harmonics | 9, 24, 45 | (byte - 128) / 128; coefficient by coefficient, red green blue |
+| | 3 | versions 1 and 2: x, y, z = byte / 127.5 - 1, w >= 0 |
+| harmonics | 9, 24, 45, 72 | (byte - 128) / 128; coefficient by coefficient, red green blue |
 
 Little endian. Axes are right, up, back. There is no place for where positions count from: they are written as they
 are, in the model's own frame.
@@ -41,6 +42,7 @@ import numpy as np
 from compgs.errors import MissingDependency, SplatFileError, install_line
 from compgs.formats.arrays import (
     MAX_DEGREE,
+    MOST_DEGREE_HELD,
     SplatArrays,
     check_count,
     checked,
@@ -52,7 +54,7 @@ from compgs.formats.frames import RIGHT_UP_BACK, turned
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
-VERSIONS = (2, 3, 4)
+VERSIONS = (1, 2, 3, 4)
 WRITTEN_VERSIONS = (3, 4)
 HAS_EXTENSIONS = 2
 _HEADER = struct.Struct("<4sIIBBBB")
@@ -79,7 +81,7 @@ class SpzHeader:
 
     version: int
     count: int  # splats
-    degree: int
+    degree: int  # of the harmonics in the file, which may be more than are read
     fractional_bits: int
     flags: int
     streams: int
@@ -92,7 +94,9 @@ class SpzHeader:
 
 
 def columns_of(version: int, degree: int) -> dict[str, int]:
-    sizes = {"positions": 9, "opacities": 1, "colors": 3, "scales": 3, "rotations": 3 if version == 2 else 4}
+    sizes = {"positions": 9, "opacities": 1, "colors": 3, "scales": 3, "rotations": 4}
+    sizes |= {"rotations": 3} if version <= 2 else {}
+    sizes |= {"positions": 6} if version == 1 else {}
     return {**sizes, "harmonics": 3 * harmonics_above_dc(degree)} if degree else sizes
 
 
@@ -194,13 +198,16 @@ def read(path: Path) -> SplatArrays:
         name: np.frombuffer(column, np.uint8).reshape(header.count, -1)
         for name, column in zip(header.columns, columns, strict=True)
     }
-    rotations = arrays["rotations"]
+    positions, rotations = arrays["positions"], arrays["rotations"]
     count, coefficients = header.count, harmonics_above_dc(header.degree)
     rest = arrays.get("harmonics", np.zeros((count, 0), np.uint8)).reshape(count, coefficients, 3)
+    rest = rest[:, : harmonics_above_dc(MAX_DEGREE)]
     found = SplatArrays(
-        means=_positions(arrays["positions"], header.fractional_bits),
+        means=_half_positions(positions)
+        if header.version == 1
+        else _positions(positions, header.fractional_bits),
         log_scales=arrays["scales"] / np.float32(SCALE_STEPS) + np.float32(SCALE_START),
-        quaternions=_short_rotations(rotations) if header.version == 2 else _rotations(rotations),
+        quaternions=_short_rotations(rotations) if header.version <= 2 else _rotations(rotations),
         opacity_logits=logit(arrays["opacities"][:, 0] / 255),
         dc=((arrays["colors"] / 255 - 0.5) / COLOR_SCALE).astype(np.float32),
         rest=(rest.astype(np.float32) - 128) / 128,
@@ -221,7 +228,8 @@ def component_bytes(path: Path) -> dict[str, int]:
 def _header(path: Path, data: bytes) -> SpzHeader:
     """Checked against the size of the file."""
     compressed = data.startswith(GZIP_MAGIC)
-    layout = _HEADER if compressed else _LONG_HEADER
+    long = not compressed and len(data) >= 8 and struct.unpack_from("<I", data, 4)[0] >= 4
+    layout = _LONG_HEADER if long else _HEADER
     try:
         begin = (
             zlib.decompressobj(wbits=31).decompress(data, layout.size) if compressed else data[: layout.size]
@@ -231,11 +239,11 @@ def _header(path: Path, data: bytes) -> SpzHeader:
     if len(begin) < layout.size or not begin.startswith(MAGIC):
         raise SplatFileError(f"{path}: does not begin as an .spz file does, or ends within its header")
     header = SpzHeader(*(*layout.unpack(begin), 0)[1:8])
-    if header.version not in VERSIONS or (header.version == 4) == compressed:
+    if header.version not in VERSIONS or (header.version == 4 and compressed):
         kind = "inside gzip" if compressed else "outside gzip"
-        raise SplatFileError(f"{path}: version {header.version} {kind}; expected 2 or 3 inside, or 4 outside")
-    if header.degree > MAX_DEGREE:
-        raise SplatFileError(f"{path}: harmonics of degree {header.degree}; expected 0 to {MAX_DEGREE}")
+        raise SplatFileError(f"{path}: version {header.version} {kind}; expected 1 to 3, or 4 outside")
+    if header.degree > MOST_DEGREE_HELD:
+        raise SplatFileError(f"{path}: harmonics of degree {header.degree}; expected 0 to {MOST_DEGREE_HELD}")
     if header.fractional_bits > MOST_FRACTIONAL_BITS:
         raise SplatFileError(
             f"{path}: {header.fractional_bits} fractional bits; expected 0 to {MOST_FRACTIONAL_BITS}"
@@ -250,13 +258,16 @@ def _gzip_columns(path: Path, header: SpzHeader, data: bytes) -> list[bytes]:
     sizes = [header.count * size for size in header.columns.values()]
     promised = _HEADER.size + sum(sizes)
     most = promised + (_MOST_EXTENSION_BYTES if header.flags & HAS_EXTENSIONS else 0)
-    unpacker = zlib.decompressobj(wbits=31)
-    try:
-        # One byte more than there may be: a file that has more is not unpacked to its end.
-        content = unpacker.decompress(data, most + 1)
-    except zlib.error as error:
-        raise SplatFileError(f"{path}: is damaged ({error}); copy it again") from error
-    if not promised <= len(content) <= most or not unpacker.eof or unpacker.unused_data:
+    content, whole = data, True
+    if data.startswith(GZIP_MAGIC):
+        unpacker = zlib.decompressobj(wbits=31)
+        try:
+            # One byte more than there may be: a file that has more is not unpacked to its end.
+            content = unpacker.decompress(data, most + 1)
+        except zlib.error as error:
+            raise SplatFileError(f"{path}: is damaged ({error}); copy it again") from error
+        whole = unpacker.eof and not unpacker.unused_data
+    if not promised <= len(content) <= most or not whole:
         found = f"more than {most}" if len(content) > most else str(len(content))
         raise SplatFileError(
             f"{path}: {header.count} splats are {promised} bytes unpacked, the file holds {found}; copy it again"
@@ -310,6 +321,11 @@ def _positions(columns: np.ndarray, bits: int) -> np.ndarray:
     return ((words.view("<i4")[:, :, 0] >> 8) / 2.0**bits).astype(np.float32)
 
 
+def _half_positions(columns: np.ndarray) -> np.ndarray:
+    """[M, 6] bytes of version 1 -> [M, 3]."""
+    return np.ascontiguousarray(columns).view("<f2").astype(np.float32)
+
+
 def _rotations(columns: np.ndarray) -> np.ndarray:
     """[M, 4] bytes -> [M, 4] w-x-y-z."""
     words = np.ascontiguousarray(columns).view("<u4")[:, 0]
@@ -326,7 +342,7 @@ def _rotations(columns: np.ndarray) -> np.ndarray:
 
 
 def _short_rotations(columns: np.ndarray) -> np.ndarray:
-    """[M, 3] bytes of version 2 -> [M, 4] w-x-y-z."""
+    """[M, 3] bytes of versions 1 and 2 -> [M, 4] w-x-y-z."""
     xyz = columns / 127.5 - 1
     w = np.sqrt(np.maximum(1 - (xyz**2).sum(1), 0))
     return np.column_stack([w, xyz]).astype(np.float32)
