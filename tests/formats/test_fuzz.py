@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from compgs.errors import CompGSError
-from compgs.formats import FORMATS, SplatArrays, encoded
+from compgs.formats import FORMATS, SplatArrays, encoded, ply_compressed, ply_text
 from compgs.formats import glb as glb_format
+from compgs.formats import ksplat as ksplat_format
 from compgs.formats import ply as ply_format
 from compgs.formats import sog as sog_format
 from compgs.formats import splat as splat_format
 from compgs.formats import spz as spz_format
 from compgs.formats.arrays import checked
+
+from .foreign import CompressedPly, ksplat_file, text_ply
 
 READERS = {
     "ply": ply_format,
@@ -21,6 +24,9 @@ READERS = {
     "sog": sog_format,
     "glb": glb_format,
     "splat": splat_format,
+    "text": ply_text,
+    "compressed": ply_compressed,
+    "ksplat": ksplat_format,
 }
 ROUNDS = 250
 
@@ -29,6 +35,12 @@ def whole(made, name: str) -> bytes:
     if name == "splat":
         row = np.array([0, 0, 1, 0.1, 0.1, 0.1], "<f4").tobytes() + bytes([9, 9, 9, 255, 255, 128, 128, 128])
         return row * 9
+    if name == "text":
+        return text_ply(encoded(made(9, 1), "ply"))
+    if name == "compressed":
+        return CompressedPly(300, 1).content()
+    if name == "ksplat":
+        return ksplat_file(1)
     if name == "spz4":
         pytest.importorskip("zstandard")
         return spz_format.encoded(made(30, 1), 4)

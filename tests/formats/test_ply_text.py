@@ -18,17 +18,9 @@ from compgs.formats import (
 )
 from compgs.formats.ply import property_groups
 
+from .foreign import text_ply
+
 CASE = Path(__file__).parents[3] / "shared" / "cases" / "ply_ascii" / "scene.ply"
-
-
-def as_text(path: Path, *, end: str = "\n") -> bytes:
-    """The rows of a binary file, which another test pins to the layout, in decimal digits."""
-    header, _, body = path.read_bytes().partition(b"end_header\n")
-    names = [line.split()[2].decode() for line in header.splitlines() if line.startswith(b"property")]
-    rows = np.frombuffer(body, "<f4").reshape(-1, len(names))
-    lines = [*header.decode().replace("binary_little_endian", "ascii").splitlines(), "end_header"]
-    lines += [" ".join(repr(float(x)) for x in row) for row in rows]
-    return (end.join(lines) + end).encode()
 
 
 @pytest.fixture
@@ -41,7 +33,7 @@ def binary(made, tmp_path: Path) -> Path:
 @pytest.fixture
 def text(binary: Path, tmp_path: Path) -> Path:
     path = tmp_path / "text.ply"
-    path.write_bytes(as_text(binary))
+    path.write_bytes(text_ply(binary.read_bytes()))
     return path
 
 
@@ -52,7 +44,7 @@ def same(one: SplatArrays, other: SplatArrays) -> None:
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_text_is_read_as_the_numbers_that_it_shows(binary: Path, text: Path, end: str) -> None:
-    text.write_bytes(as_text(binary, end=end))
+    text.write_bytes(text_ply(binary.read_bytes(), end=end))
     check_scene(text)
     same(ply_text.read(text), read_ply(binary))
     same(open_scene(text).splats, read_ply(binary))

@@ -21,13 +21,15 @@ from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
 from compgs.render import Renderable
 
+from .foreign import ksplat_file
+
 SPLAT = np.array([0, 0, 1, 0.1, 0.1, 0.1], "<f4").tobytes() + bytes([200, 100, 50, 255, 255, 128, 128, 128])
 
 
 @pytest.fixture
 def contents(made, cgs_bytes: bytes) -> dict[str, bytes]:
     written = {name: encoded(made(20, 1), name) for name in WRITERS}
-    return {**written, "cgs": cgs_bytes, "splat": SPLAT * 3}
+    return {**written, "cgs": cgs_bytes, "splat": SPLAT * 3, "ksplat": ksplat_file(2)}
 
 
 def test_every_format_is_known_by_its_content_alone(contents: dict[str, bytes], tmp_path: Path) -> None:
@@ -53,7 +55,7 @@ def test_every_format_opens_as_something_that_can_be_rendered(
         assert isinstance(model, HybridModel if name == "cgs" else SplatModel)
         if name != "cgs":
             assert model.background == (0.25, 0.5, 0.75)
-            assert model.counts == {"splats": 3 if name == "splat" else 20}
+            assert model.counts == {"splats": {"splat": 3, "ksplat": 18}.get(name, 20)}
         assert model.over((1.0, 0.0, 0.0)).background == (1.0, 0.0, 0.0)
         assert len(model.bounds[0]) == len(model.bounds[1]) == next(iter(model.counts.values()))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from compgs.devices import placed
 from compgs.errors import NotACompGSFile, OutputError, SplatFileError
-from compgs.formats import cgs, glb, packed, ply, ply_text, sog, splat, spz, tiled
+from compgs.formats import cgs, glb, ksplat, packed, ply, ply_compressed, ply_text, sog, splat, spz, tiled
 from compgs.formats.arrays import SplatArrays
 from compgs.model.splats import SplatModel
 
@@ -63,11 +63,19 @@ def _open_tiles(path: Path, device: "Device", background: Background) -> "Render
 FORMATS = (
     Format("cgs", cgs.begins, cgs.check, cgs.component_bytes, _open_cgs),
     Format("ply", ply_text.begins, ply_text.check, ply_text.component_bytes, _opens_splats(ply_text.read)),
+    Format(
+        "ply",
+        ply_compressed.begins,
+        ply_compressed.check,
+        ply_compressed.component_bytes,
+        _opens_splats(ply_compressed.read),
+    ),
     Format("ply", ply.begins, ply.check, ply.component_bytes, _opens_splats(ply.read)),
     Format("spz", spz.begins, spz.check, spz.component_bytes, _opens_splats(spz.read)),
     Format("tiles", tiled.begins, tiled.check, tiled.component_bytes, _open_tiles),
     Format("sog", sog.begins, sog.check, sog.component_bytes, _opens_splats(sog.read)),
     Format("glb", glb.begins, glb.check, glb.component_bytes, _opens_splats(glb.read)),
+    Format("ksplat", ksplat.begins, ksplat.check, ksplat.component_bytes, _opens_splats(ksplat.read)),
     Format("packed", packed.begins, packed.check, packed.component_bytes, _open_packed),
     Format("splat", splat.begins, splat.check, splat.component_bytes, _opens_splats(splat.read)),
 )
