@@ -144,9 +144,8 @@ def end_to_end(given: Given) -> dict[str, Any]:
     camera = scene.test_views[0].camera
     here = np.asarray(compgs.render(decoded, camera).image, np.float64)
     from compgs.devices import placed
-    from compgs.render.render_model import render_model
 
-    there = np.asarray(render_model(placed(decoded, given.device), camera).image, np.float64)
+    there = np.asarray(compgs.render(placed(decoded, given.device), camera).image, np.float64)
     apart = -10 * np.log10(max(float(((here.clip(0, 1) - there.clip(0, 1)) ** 2).mean()), 1e-12))
     results = compgs.evaluate(path, scene, device="cpu")
     estimate = (sum(model.estimated_bits(model.mask).values())) / 8
