@@ -14,8 +14,8 @@ SOURCE = Path(compgs.__file__).parent
 
 # A part may import itself, and the parts named here.
 BASE = {
-    "compgs", "numerics", "errors", "extras", "gaussians", "cameras", "config", "interrupt", "outputs", "presets",
-    "words",
+    "compgs", "numerics", "errors", "extras", "gaussians", "cameras", "config", "interrupt", "notes", "outputs",
+    "presets", "words",
 }  # fmt: skip
 ALLOWED = {
     "compgs": {
@@ -38,6 +38,7 @@ ALLOWED = {
     "extras": {"errors"},
     "devices": {"errors", "extras", "tensors"},
     "interrupt": set(),
+    "notes": set(),
     "outputs": {"errors"},
     "words": set(),
     "gaussians": set(),

@@ -261,7 +261,7 @@ def own_cameras(model: Renderable) -> list[Camera]:
 def as_others_draw(model: Renderable, cameras: Sequence[Camera]) -> RasterSettings:
     """How other programs draw splats in pictures of the cameras' size; so that they can be fitted in smaller ones."""
     if model.angular_dilation is None:
-        return RasterSettings(background=model.background)
+        return RasterSettings(background=model.background, antialiased=model.antialiased)
     angle = as_angle(DEFAULT_SETTINGS.dilation, cameras)
     return RasterSettings(background=model.background, angular_dilation=angle)
 

@@ -30,11 +30,7 @@ def splats_at(means: np.ndarray, size: float, opacity: float = 0.95, seed: int =
 
 def joined(*parts: SplatArrays) -> SplatArrays:
     return SplatArrays(
-        **{
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in vars(parts[0])
-            if name != "world_offset"
-        }
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in parts[0].columns}
     )
 
 

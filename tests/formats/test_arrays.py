@@ -1,5 +1,6 @@
 """The arrays between files and models, and what no file may make of them."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,8 @@ import pytest
 import torch
 
 from compgs.errors import SplatFileError
-from compgs.formats.arrays import check_count, checked, degree_of, logit, normalized, sigmoid
+from compgs.formats.arrays import check_count, degree_of, drawable, joined, logit, normalized, sigmoid
+from compgs.model.splats import SplatArrays
 from compgs.tensors.splats import Splats
 
 PLACE = Path("a.spz")
@@ -66,22 +68,81 @@ def test_more_splats_than_a_file_can_hold_are_refused() -> None:
             check_count(PLACE, count, size)
 
 
+def with_value(arrays: SplatArrays, name: str, row: int | slice, value: float) -> SplatArrays:
+    changed = getattr(arrays, name).copy()
+    changed[row] = value
+    return replace(arrays, **{name: changed})
+
+
 @pytest.mark.parametrize(
-    ("name", "value", "message"),
+    ("name", "value", "reason"),
     [
-        ("means", np.nan, "means of splat 2 hold nan"),
-        ("rest", np.inf, "rest of splat 2 hold inf"),
-        ("opacity_logits", -np.inf, "opacity_logits of splat 2 hold -inf"),
-        ("log_scales", 88.5, "log_scales of splat 2 hold 88.5, expected a finite number up to 88"),
-        ("quaternions", 0.0, "quaternion of splat 2 is zero"),
+        ("means", np.nan, "without a position"),
+        ("means", np.inf, "without a position"),
+        ("rest", np.inf, "without a color"),
+        ("dc", np.nan, "without a color"),
+        ("opacity_logits", np.nan, "without an opacity"),
+        ("log_scales", 88.5, "without a size"),
+        ("log_scales", np.nan, "without a size"),
+        ("log_scales", np.inf, "without a size"),
+        ("quaternions", 0.0, r"without a rotation \(their quaternion is zero\)"),
+        ("quaternions", np.inf, r"without a rotation \(not a finite number\)"),
     ],
 )
-def test_numbers_that_nothing_can_be_rendered_from_are_named(
-    made, name: str, value: float, message: str
+def test_what_nothing_can_be_drawn_from_is_left_out_and_counted(
+    made, caplog: pytest.LogCaptureFixture, name: str, value: float, reason: str
 ) -> None:
-    arrays = made(4)
-    assert checked(PLACE, arrays) is arrays
-    changed = getattr(arrays, name).copy()
-    changed[2] = value
-    with pytest.raises(SplatFileError, match=message):
-        checked(PLACE, replace(arrays, **{name: changed}))
+    arrays = made(6)
+    assert drawable(PLACE, arrays) is arrays
+    found = drawable(PLACE, with_value(arrays, name, 2, value))
+    for column, expected in arrays.columns.items():
+        np.testing.assert_array_equal(found.columns[column], np.delete(expected, 2, axis=0))
+    (record,) = caplog.records
+    assert re.search(rf"a\.spz: 1 of 6 splats were left out: 1 {reason}.* splat 2\)$", record.getMessage())
+
+
+def test_a_splat_with_several_faults_is_counted_once(made, caplog: pytest.LogCaptureFixture) -> None:
+    arrays = with_value(made(8), "quaternions", slice(0, 2), 0.0)
+    arrays = with_value(with_value(arrays, "means", 0, np.nan), "dc", 5, np.nan)
+    assert len(drawable(PLACE, arrays)) == 5
+    assert "3 of 8 splats were left out: 2 without a rotation" in caplog.text
+    assert "1 without a color (not a finite number) (the first is splat 5)" in caplog.text
+
+
+def test_a_file_most_of_whose_splats_cannot_be_drawn_is_refused_with_the_reasons(made) -> None:
+    arrays = with_value(made(6), "quaternions", slice(1, 4), 0.0)
+    assert len(drawable(PLACE, arrays)) == 3
+    arrays = with_value(arrays, "means", 5, np.nan)
+    with pytest.raises(
+        SplatFileError, match=r"4 of 6 splats cannot be drawn: 3 without a rotation.*; 1 without"
+    ):
+        drawable(PLACE, arrays)
+
+
+def test_infinite_numbers_that_mean_something_are_read(made, caplog: pytest.LogCaptureFixture) -> None:
+    arrays = with_value(made(6), "opacity_logits", 1, np.inf)
+    arrays = with_value(arrays, "opacity_logits", 2, -np.inf)
+    arrays = with_value(arrays, "log_scales", 3, -np.inf)
+    arrays = with_value(arrays, "quaternions", 4, 3e-30)
+    arrays = with_value(arrays, "quaternions", 5, 2e30)
+    before = arrays.each(np.copy)
+    found = drawable(PLACE, arrays)
+    assert not caplog.records and len(found) == 6
+    np.testing.assert_allclose(found.opacities[1:3], [1, 0], atol=1e-6)
+    assert all(np.isfinite(column).all() for column in found.columns.values())
+    np.testing.assert_allclose(np.exp(found.log_scales[3]), 0, atol=1e-37)
+    np.testing.assert_allclose(found.quaternions[4:], 0.5, rtol=1e-6)
+    for name, column in before.columns.items():
+        np.testing.assert_array_equal(arrays.columns[name], column)
+
+
+def test_splats_of_several_places_are_joined_in_the_frame_of_the_first(made) -> None:
+    near, far = (
+        replace(made(3, 0), world_offset=(1e6, 0.0, 0.0)),
+        replace(made(2, 2), world_offset=(1e6, 2.0, 0.0)),
+    )
+    found = joined([near, far])
+    assert len(found) == 5 and found.degree == 2 and found.world_offset == (1e6, 0.0, 0.0)
+    np.testing.assert_array_equal(found.means[3:], far.means + np.float32([0, 2, 0]))
+    np.testing.assert_array_equal(found.rest[:3], 0)
+    np.testing.assert_array_equal(found.rest[3:], far.rest)

@@ -13,7 +13,7 @@ import pytest
 from compgs.errors import SplatFileError
 from compgs.formats import glb
 from compgs.formats.arrays import SplatArrays, normalized
-from compgs.formats.frames import LEFT_UP_FORWARD, transformed, turned
+from compgs.formats.frames import LEFT_UP_FORWARD, basis, transformed, turned
 from compgs.numerics.rotations import rotation_from_quaternion
 
 PREFIX = "KHR_gaussian_splatting:"
@@ -190,8 +190,7 @@ def accessor(gltf: dict[str, Any], name: str) -> dict[str, Any]:
         (lambda data: data[:4] + b"\x01" + data[5:], "version 1"),
         (lambda data: data[:20] + b"]" + data[21:], "not JSON"),
         (edited(lambda g: []), "does not describe splats"),
-        (edited(lambda g: g.update(meshes=[])), "holds 0 sets"),
-        (edited(lambda g: g["meshes"].append(g["meshes"][0])), "holds 2 sets"),
+        (edited(lambda g: g.update(meshes=[])), "holds no splats"),
         (edited(lambda g: g.update(meshes="none")), "does not describe splats"),
         (edited(lambda g: g.update(extensionsRequired=["EXT_small"])), "needs the extension EXT_small"),
         (
@@ -216,9 +215,8 @@ def accessor(gltf: dict[str, Any], name: str) -> dict[str, Any]:
         (edited(lambda g: g.update(nodes=[{"children": [0]}])), "not a tree"),
         (edited(lambda g: g.update(nodes=[{"children": [1, 1]}, {}])), "not a tree"),
         (edited(lambda g: g.update(nodes=[{}])), "in no scene"),
-        (edited(lambda g: g["nodes"][0].update(scale=[1, 2, 1])), "stretches or mirrors"),
-        (edited(lambda g: g["nodes"][0].update(scale=[-1, 1, 1])), "stretches or mirrors"),
-        (edited(lambda g: g["nodes"][0].update(scale=[0, 0, 0])), "stretches or mirrors"),
+        (edited(lambda g: g["nodes"][0].update(scale=[1, 2, 1])), "stretches the splats"),
+        (edited(lambda g: g["nodes"][0].update(scale=[0, 0, 0])), "stretches the splats"),
         (edited(lambda g: g["nodes"][0].update(rotation=[0, 0, 0, 0])), "does not describe splats"),
         (edited(lambda g: g["nodes"][0].update(translation=[1, 2])), "does not describe splats"),
     ],
@@ -233,10 +231,140 @@ def test_a_damaged_file_is_refused_with_what_is_wrong(
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_numbers_that_cannot_be_are_refused(made, tmp_path: Path) -> None:
+def test_a_splat_without_a_place_is_left_out(made, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "a.glb"
     arrays: SplatArrays = made(3)
-    arrays.means[1, 2] = np.inf
-    path.write_bytes(glb.encoded(arrays))
-    with pytest.raises(SplatFileError, match=r"means of splat 1|not JSON"):
+    gltf, binary = taken_apart(glb.encoded(arrays))
+    start = gltf["bufferViews"][accessor(gltf, "POSITION")["bufferView"]]["byteOffset"]
+    path.write_bytes(
+        put_together(gltf, binary[: start + 12] + struct.pack("<f", np.inf) + binary[start + 16 :])
+    )
+    np.testing.assert_array_equal(glb.read(path).means, arrays.means[[0, 2]])
+    assert "1 of 3 splats were left out" in caplog.text
+
+
+def test_a_mesh_that_two_nodes_place_is_there_twice(made, tmp_path: Path) -> None:
+    arrays = made(5)
+    move = {"mesh": 0, "translation": [10, 0, 0]}
+    path = tmp_path / "a.glb"
+    data = edited(lambda g: g.update(nodes=[{"mesh": 0}, move], scenes=[{"nodes": [0, 1]}]))(
+        glb.encoded(arrays)
+    )
+    path.write_bytes(data)
+    found = glb.read(path)
+    np.testing.assert_array_equal(found.means[:5], arrays.means)
+    np.testing.assert_allclose(found.means[5:], arrays.means + [-10, 0, 0], rtol=1e-6)  # left is -x
+    np.testing.assert_array_equal(found.rest[5:], arrays.rest)
+    sizes = glb.component_bytes(path)
+    assert sum(sizes.values()) == len(data) and sizes["positions"] == 60  # there once
+
+
+def test_several_meshes_and_primitives_are_read_and_what_no_scene_shows_is_not(made, tmp_path: Path) -> None:
+    arrays = made(4, 1)
+
+    def more(gltf: dict[str, Any]) -> None:
+        gltf["meshes"] = [
+            {"primitives": [primitive(gltf)]},
+            {"primitives": [primitive(gltf), primitive(gltf)]},
+            {"primitives": [primitive(gltf)]},
+        ]
+        hidden = {"KHR_node_visibility": {"visible": False}}
+        gltf["nodes"] = [
+            {"mesh": 0, "children": [1]},
+            {"mesh": 1, "translation": [0, 3, 0]},
+            {"mesh": 2},
+            {"mesh": 2, "extensions": hidden},
+        ]
+        gltf["scenes"] = [{"nodes": [2]}, {"nodes": [0, 3]}]
+        gltf["scene"] = 1
+
+    path = tmp_path / "a.glb"
+    path.write_bytes(edited(more)(glb.encoded(arrays)))
+    found = glb.read(path)
+    expected = np.concatenate([arrays.means, *[arrays.means - np.float32([0, 3, 0])] * 2])  # up is -y
+    np.testing.assert_allclose(found.means, expected, atol=1e-6)
+
+
+def test_a_mirroring_node_mirrors_the_splats(made, tmp_path: Path) -> None:
+    arrays = made(6)
+    path = tmp_path / "a.glb"
+    path.write_bytes(edited(lambda g: g["nodes"][0].update(scale=[2, -2, 2]))(glb.encoded(arrays)))
+    found, mirror = glb.read(path), np.diag([2.0, -2.0, 2.0])
+    np.testing.assert_allclose(found.means, arrays.means @ mirror, rtol=1e-6)
+    np.testing.assert_allclose(
+        covariances(found), mirror @ covariances(arrays) @ mirror, rtol=1e-4, atol=1e-7
+    )
+    directions = np.random.default_rng(0).normal(size=(9, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = np.einsum("nk,mkc->nmc", basis(directions, 3)[:, 1:], found.rest)
+    mirrored = np.einsum("nk,mkc->nmc", basis(directions * [1, -1, 1], 3)[:, 1:], arrays.rest)
+    np.testing.assert_allclose(seen, mirrored, atol=1e-5)
+
+
+def covariances(arrays: SplatArrays) -> np.ndarray:
+    """[M, 3, 3], float64."""
+    turns = np.stack([rotation_from_quaternion(q) for q in normalized(arrays.quaternions)])
+    factors = turns * np.exp(arrays.log_scales.astype(np.float64))[:, None]
+    return factors @ factors.transpose(0, 2, 1)
+
+
+def test_nodes_may_not_make_more_splats_than_a_file_can_hold(made, tmp_path: Path) -> None:
+    path = tmp_path / "a.glb"
+    for nodes, message in ((5000, "more than 4096 times"), (4000, "promises 160000 splats")):
+        every = edited(
+            lambda g, n=nodes: g.update(nodes=[{"mesh": 0}] * n, scenes=[{"nodes": list(range(n))}])
+        )
+        content = every(glb.encoded(made(40, 0)))
+        path.write_bytes(content)
+        if nodes == 4000 and 8 * len(content) > 160_000:
+            continue
+        with pytest.raises(SplatFileError, match=message):
+            glb.read(path)
+
+
+def extended(gltf: dict[str, Any]) -> dict[str, Any]:
+    return primitive(gltf)["extensions"]["KHR_gaussian_splatting"]
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda g: extended(g).update(kernel="box"), "kernel 'box' (drawn as ellipse)"),
+        (lambda g: extended(g).update(projection="fisheye"), "projection 'fisheye' (drawn as perspective)"),
+        (lambda g: extended(g).update(sortingMethod="zDepth"), "sortingMethod 'zDepth'"),
+        (lambda g: extended(g).update(extensions={"EXT_more": {}}), "extension EXT_more"),
+        (lambda g: primitive(g)["attributes"].update(_TIME=0), "attribute _TIME"),
+        (lambda g: g["meshes"].append({"primitives": [{"attributes": {}}]}), "1 meshes of triangles"),
+        (lambda g: g.update(animations=[{}]), "animations"),
+    ],
+)
+def test_what_is_not_used_is_told(
+    made, tmp_path: Path, caplog: pytest.LogCaptureFixture, change: Callable[[dict[str, Any]], Any], told: str
+) -> None:
+    path = tmp_path / "a.glb"
+    path.write_bytes(edited(lambda g: change(g) and None)(glb.encoded(made(4))))
+    assert len(glb.read(path)) == 4
+    (record,) = caplog.records
+    assert record.getMessage().startswith(f"{path}: not used: ") and told in record.getMessage()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda g: g["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}}),
+            "node 0 places its mesh by EXT_mesh_gpu_instancing",
+        ),
+        (
+            lambda g: (primitive(g).update(attributes={}), extended(g).update(extensions={"SPZ_packed": {}})),
+            "packed by the extension SPZ_packed",
+        ),
+    ],
+)
+def test_what_would_change_the_picture_is_refused(
+    made, tmp_path: Path, change: Callable[[dict[str, Any]], Any], message: str
+) -> None:
+    path = tmp_path / "a.glb"
+    path.write_bytes(edited(lambda g: change(g) and None)(glb.encoded(made(4))))
+    with pytest.raises(SplatFileError, match=message):
         glb.read(path)

@@ -131,11 +131,6 @@ def without_rotation(data: bytes) -> bytes:
         (edited(b"float opacity", b"float x"), "'x' is there twice"),
         (edited(b"float opacity", b"list uchar int opacity"), "not a property"),
         (edited(b"float opacity", b"half opacity"), "not a property"),
-        (with_number(1, float("nan")), "y of splat 2 is nan"),
-        (with_number(54, float("inf")), "opacity of splat 2 is inf"),
-        (with_number(20, float("-inf")), "f_rest_11 of splat 2 is -inf"),
-        (with_number(55, 1000.0), "scale_0 of splat 2 is 1000.0"),
-        (without_rotation, "splat 1 are all zero"),
     ],
 )
 def test_a_damaged_file_is_refused_with_what_is_wrong(
@@ -145,6 +140,146 @@ def test_a_damaged_file_is_refused_with_what_is_wrong(
     with pytest.raises(SplatFileError, match=message) as caught:
         read_ply(file)
     assert str(caught.value).startswith(f"{file}: ")
+
+
+@pytest.mark.parametrize(
+    ("damage", "left"),
+    [
+        (with_number(1, float("nan")), [0, 1, 3, 4]),
+        (with_number(20, float("-inf")), [0, 1, 3, 4]),
+        (with_number(55, 1000.0), [0, 1, 3, 4]),
+        (without_rotation, [0, 2, 3, 4]),
+    ],
+)
+def test_a_splat_that_cannot_be_drawn_is_left_out_and_counted(
+    file: Path, damage: Callable[[bytes], bytes], left: list[int], caplog: pytest.LogCaptureFixture
+) -> None:
+    file.write_bytes(damage(file.read_bytes()))
+    np.testing.assert_array_equal(read_ply(file).means, made().means[left])
+    (record,) = caplog.records
+    assert record.getMessage().startswith(f"{file}: 1 of 5 splats were left out: 1 without a ")
+
+
+def test_infinite_opacities_are_opaque_or_invisible(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for value, opacity in ((float("inf"), 1), (float("-inf"), 0)):
+        file.write_bytes(with_number(54, value)(file.read_bytes()))
+        assert read_ply(file).opacities[2] == pytest.approx(opacity, abs=1e-6)
+    assert not caplog.records
+
+
+def with_comments(*comments: bytes) -> Callable[[bytes], bytes]:
+    text = b"".join(b"comment " + comment + b"\n" for comment in comments)
+    return edited(b"element vertex", text + b"element vertex")
+
+
+@pytest.mark.parametrize(
+    ("comments", "antialiased"),
+    [
+        ([], False),
+        ([b"SplatRenderMode: mip"], True),
+        ([b"splatrendermode: MIP"], True),
+        ([b"SplatRenderMode: default"], False),
+        ([b"antialiased 1"], True),
+        ([b"antialiased 0"], False),
+        ([b"SplatRenderMode: mip", b"antialiased 0"], False),
+        ([b"antialiased 0", b"SplatRenderMode: mip"], True),
+        ([b"antialiased", b"is antialiased 1", b"SplatRenderMode:"], False),
+    ],
+)
+def test_comments_say_whether_splats_are_antialiased(
+    file: Path, comments: list[bytes], antialiased: bool
+) -> None:
+    file.write_bytes(with_comments(*comments)(file.read_bytes()))
+    assert read_ply(file).antialiased is antialiased
+
+
+def test_antialiased_splats_are_written_as_such(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(replace(made(), antialiased=True), path)
+    assert b"\ncomment SplatRenderMode: mip\n" in path.read_bytes()
+    assert read_ply(path).antialiased
+    write_ply(made(), path, overwrite=True)
+    assert b"comment" not in path.read_bytes()
+
+
+def other_layout(
+    path: Path, splats: SplatArrays, extra: dict[str, np.ndarray], left_out: tuple[str, ...] = ()
+) -> None:
+    """A file in which some properties are missing and others are there."""
+    columns = {"x": splats.means[:, 0], "y": splats.means[:, 1], "z": splats.means[:, 2]}
+    columns |= {f"f_dc_{i}": splats.dc[:, i] for i in range(3)} | {"opacity": splats.opacity_logits}
+    columns |= {f"scale_{i}": splats.log_scales[:, i] for i in range(3)}
+    columns |= {f"rot_{i}": splats.quaternions[:, i] for i in range(4)} | extra
+    columns = {name: column for name, column in columns.items() if name not in left_out}
+    kinds = {"u1": "uchar", "u2": "ushort", "f4": "float"}
+    table = np.zeros(len(splats), [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        table[name] = column
+    properties = (f"property {kinds[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(splats)}\n{''.join(properties)}end_header\n"
+    path.write_bytes(header.encode() + table.tobytes())
+
+
+COLORS = ("f_dc_0", "f_dc_1", "f_dc_2")
+RGB = ("red", "green", "blue")
+
+
+@pytest.mark.parametrize(
+    ("kind", "whole"), [(np.uint8, 255), (np.uint16, 65535), (np.float32, 1), (np.float32, 255)]
+)
+def test_display_colors_stand_for_harmonics_of_degree_0(tmp_path: Path, kind: type, whole: int) -> None:
+    splats, path = made(3, 0), tmp_path / "a.ply"
+    shares = np.array([[0.2, 0.4, 1], [0, 0.6, 0.8], [1, 0, 0.2]])
+    rgb = {name: (shares[:, i] * whole).round(6).astype(kind) for i, name in enumerate(RGB)}
+    other_layout(path, splats, rgb, COLORS)
+    found = read_ply(path)
+    np.testing.assert_allclose(0.5 + 0.28209479 * found.dc, shares, atol=1 / 65535 + 1e-6)
+    np.testing.assert_array_equal(found.means, splats.means)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "message"),
+    [
+        (
+            COLORS,
+            "its splats have no colors: expected properties f_dc_0, f_dc_1, f_dc_2, or red, green, blue",
+        ),
+        (("f_dc_1",), "'f_dc_1' is missing; export the scene again"),
+        (("rot_2",), "'rot_2' is missing; export the scene again"),
+        (("scale_0", "scale_1", "scale_2"), "'scale_0' is missing; export the scene again"),
+    ],
+)
+def test_what_is_missing_is_named(tmp_path: Path, left_out: tuple[str, ...], message: str) -> None:
+    path = tmp_path / "a.ply"
+    other_layout(path, made(3, 0), {}, left_out)
+    with pytest.raises(SplatFileError, match=message):
+        read_ply(path)
+
+
+def test_the_smoothing_filter_of_mip_splatting_widens_and_dilutes(tmp_path: Path) -> None:
+    """Against the volume of the Gaussian, which a convolution keeps: opacity times the product of the extents."""
+    splats, path = made(6, 0), tmp_path / "a.ply"
+    widths = np.float32([0.5, 0, 0.01, 3, 1e-3, 0.2])
+    splats = replace(splats, opacity_logits=np.float32([2, np.inf, -1, 0, 3, 30]))
+    other_layout(path, splats, {"filter_3D": widths})
+    found = read_ply(path)
+    scales, before = np.exp(found.log_scales.astype(float)), np.exp(splats.log_scales.astype(float))
+    np.testing.assert_allclose(scales**2, before**2 + widths[:, None] ** 2, rtol=1e-5)
+    volumes = found.opacities * scales.prod(1), splats.opacities * before.prod(1)
+    np.testing.assert_allclose(*volumes, rtol=1e-4)
+    assert found.antialiased
+
+
+def test_properties_and_elements_that_are_not_used_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, count = tmp_path / "a.ply", np.zeros(3, np.uint8)
+    other_layout(path, made(3, 0), {"time": count, "label": count, "red": count, "nx": count})
+    content = path.read_bytes().replace(b"end_header", b"element camera 1\nproperty float f\nend_header")
+    path.write_bytes(content + bytes(4))
+    assert len(read_ply(path)) == 3
+    (record,) = caplog.records
+    assert record.getMessage() == f"{path}: not used: properties time, label; elements camera"
 
 
 def test_points_are_not_taken_for_splats(tmp_path: Path) -> None:

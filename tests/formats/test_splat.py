@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compgs.errors import SplatFileError
-from compgs.formats import splat
-from compgs.formats.arrays import Y0
+from compgs.errors import NotACompGSFile, SplatFileError
+from compgs.formats import format_of, splat
+from compgs.formats.arrays import Y0, normalized
 
 ROW = struct.pack("<3f3f", 1.5, -2.0, 3.25, 0.5, 0.25, 1.0) + bytes([255, 0, 51, 102, 192, 128, 128, 239])
 
@@ -42,9 +42,6 @@ def test_flat_splats_are_read(tmp_path: Path) -> None:
     [
         (ROW[:-1], "31 bytes are not whole splats"),
         (b"", "0 bytes"),
-        (ROW + struct.pack("<6f", 0, 0, float("nan"), 1, 1, 1) + ROW[24:], "means of splat 1 hold nan"),
-        (ROW + struct.pack("<6f", 0, 0, 0, 1, -1, 1) + ROW[24:], "scales of splat 1"),
-        (ROW + ROW[:28] + bytes([128] * 4), "quaternion of splat 1 is zero"),
     ],
 )
 def test_a_damaged_file_is_refused_with_what_is_wrong(tmp_path: Path, content: bytes, message: str) -> None:
@@ -52,6 +49,46 @@ def test_a_damaged_file_is_refused_with_what_is_wrong(tmp_path: Path, content: b
     path.write_bytes(content)
     with pytest.raises(SplatFileError, match=message):
         splat.read(path)
+
+
+@pytest.mark.parametrize(
+    ("row", "reason"),
+    [
+        (struct.pack("<6f", 0, 0, float("nan"), 1, 1, 1) + ROW[24:], "without a position"),
+        (struct.pack("<6f", 0, 0, 0, 1, -1, 1) + ROW[24:], "without a size"),
+        (ROW[:28] + bytes([128] * 4), "without a rotation"),
+    ],
+)
+def test_a_splat_that_cannot_be_drawn_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, row: bytes, reason: str
+) -> None:
+    path = tmp_path / "a.splat"
+    path.write_bytes(ROW + row + ROW)
+    assert len(splat.read(path)) == 2
+    assert f"1 of 3 splats were left out: 1 {reason}" in caplog.text
+
+
+def test_an_odd_rotation_among_the_first_splats_is_that_of_one_splat(tmp_path: Path) -> None:
+    odd = ROW[:28] + bytes([255, 255, 0, 255])  # twice as long as a rotation is
+    path = tmp_path / "a.splat"
+    path.write_bytes(ROW * 3 + odd + ROW * 20)
+    assert format_of(path).name == "splat"
+    arrays = splat.read(path)
+    assert len(arrays) == 24
+    np.testing.assert_allclose(normalized(arrays.quaternions)[3], [0.5, 0.5, -0.5, 0.5], atol=5e-3)
+
+
+def test_a_file_that_is_named_splat_and_is_none_is_told_why(tmp_path: Path) -> None:
+    odd = ROW[:28] + bytes([255, 255, 0, 255])
+    path = tmp_path / "a.splat"
+    path.write_bytes(ROW * 2 + odd * 2)
+    with pytest.raises(
+        NotACompGSFile, match=r"2 of its first 4 splats, the first of them number 2, have a size or"
+    ):
+        format_of(path)
+    path.write_bytes(b"short")
+    with pytest.raises(NotACompGSFile, match=r"a \.splat holds 32 bytes a splat, this file has 5"):
+        format_of(path)
 
 
 def test_possible_splats_are_told_from_other_bytes() -> None:

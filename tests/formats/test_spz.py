@@ -13,6 +13,8 @@ import pytest
 from compgs.errors import MissingDependency, SplatFileError
 from compgs.formats import spz
 from compgs.formats.arrays import SplatArrays, normalized
+from compgs.formats.frames import basis
+from compgs.numerics.rotations import rotation_from_quaternion
 
 try:
     import zstandard
@@ -180,7 +182,6 @@ def at(position: int, value: bytes) -> Callable[[bytes], bytes]:
     [
         (lambda data: data[:4], "ends within its header"),
         (lambda data: data[:-12], "damaged|unpacked, the file holds"),
-        (lambda data: data + b"more", "copy it again"),
         (lambda data: data[:20] + bytes([data[20] ^ 255]) + data[21:], "a.spz"),
         (unpacked(at(4, b"\x00")), "version 0 inside gzip"),
         (unpacked(at(4, b"\x01")), "40 splats are"),
@@ -215,11 +216,129 @@ def test_a_file_that_unpacks_to_more_than_it_says_is_not_unpacked_to_its_end(mad
     assert peak < 1 << 24
 
 
-def test_extensions_after_the_splats_are_skipped(made, tmp_path: Path) -> None:
+def test_bytes_after_the_end_of_the_compressed_data_are_told(
+    made, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "a.spz"
-    content = gzip.decompress(spz.encoded(made(4)))
-    path.write_bytes(gzip.compress(content[:14] + b"\x02" + content[15:] + b"extension"))
+    path.write_bytes(spz.encoded(made(4)) + bytes(16))
     assert len(spz.read(path)) == 4
+    (record,) = caplog.records
+    assert record.getMessage() == f"{path}: not used: 16 bytes after the end of the compressed data"
+
+
+def record(kind: int, content: bytes) -> bytes:
+    return struct.pack("<II", kind, len(content)) + content
+
+
+def with_extensions(data: bytes, records: bytes, flags: int = 2) -> bytes:
+    """A file of version 3 or 4 with extensions where its version has them."""
+    if data.startswith(b"NGSP"):
+        (table,) = struct.unpack_from("<I", data, 16)
+        begin = at(16, struct.pack("<I", table + len(records)))(at(14, bytes([flags]))(data[:table]))
+        return begin + records + data[table:]
+    content = gzip.decompress(data)
+    return gzip.compress(content[:14] + bytes([flags]) + content[15:] + records)
+
+
+VERSIONS = [
+    3,
+    pytest.param(4, marks=pytest.mark.skipif(zstandard is None, reason="zstandard is not installed")),
+]
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_extensions_that_are_not_known_are_told(
+    made, tmp_path: Path, caplog: pytest.LogCaptureFixture, version: int
+) -> None:
+    path = tmp_path / "a.spz"
+    records = record(0xADBE0002, bytes(12)) + record(0x12340001, b"")
+    path.write_bytes(with_extensions(spz.encoded(made(4), version), records, flags=2 | 0x80))
+    assert len(spz.read(path)) == 4
+    (told,) = caplog.records
+    expected = "flags 0x80, extension 0xadbe0002 of 12 bytes, extension 0x12340001 of 0 bytes"
+    assert told.getMessage() == f"{path}: not used: {expected}"
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize(
+    ("records", "message"),
+    [
+        (b"short", "an extension promises"),
+        (struct.pack("<II", 0xADBE0003, 9) + bytes(4), "an extension promises 9 bytes, 4 are there"),
+        (record(0xADBE0003, struct.pack("<I", 17)), "axes number 17; expected 1 to 16"),
+        (record(0xADBE0003, struct.pack("<I", 0)), "axes number 0"),
+    ],
+)
+def test_extensions_that_are_not_whole_are_refused(
+    made, tmp_path: Path, version: int, records: bytes, message: str
+) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(with_extensions(spz.encoded(made(4), version), records))
+    with pytest.raises(SplatFileError, match=message):
+        spz.read(path)
+
+
+# By the number in the file: the directions of x, y and z, from the extension's description.
+AXES = [
+    "LDB",
+    "RDB",
+    "LUB",
+    "RUB",
+    "LDF",
+    "RDF",
+    "LUF",
+    "RUF",
+    "LFD",
+    "RFD",
+    "LFU",
+    "RFU",
+    "LBD",
+    "RBD",
+    "LBU",
+    "RBU",
+]
+HERE = {"R": [1, 0, 0], "L": [-1, 0, 0], "D": [0, 1, 0], "U": [0, -1, 0], "F": [0, 0, 1], "B": [0, 0, -1]}
+
+
+@pytest.mark.parametrize("number", range(1, 17))
+@pytest.mark.parametrize("version", VERSIONS)
+def test_axes_that_a_file_declares_are_those_of_its_splats(
+    made, tmp_path: Path, version: int, number: int
+) -> None:
+    """Means, covariances and colors of a file with other axes, by the matrix between the axes alone."""
+    path = tmp_path / "a.spz"
+    data = spz.encoded(made(5), version)
+    path.write_bytes(data)
+    usual = spz.read(path)  # right, up, back
+    path.write_bytes(with_extensions(data, record(0xADBE0003, struct.pack("<I", number))))
+    found = spz.read(path)
+    here = [np.array([HERE[letter] for letter in letters]).T for letters in (AXES[number - 1], "RUB")]
+    change = here[0] @ here[1].T  # from where the usual axes put something to where these do
+    np.testing.assert_allclose(found.means, usual.means @ change.T, atol=1e-6)
+    np.testing.assert_allclose(covariances(found), change @ covariances(usual) @ change.T, atol=1e-6)
+    directions = np.random.default_rng(0).normal(size=(9, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = np.einsum("nk,mkc->nmc", basis(directions @ change.T, 3)[:, 1:], found.rest)
+    expected = np.einsum("nk,mkc->nmc", basis(directions, 3)[:, 1:], usual.rest)
+    np.testing.assert_allclose(seen, expected, atol=1e-5)
+
+
+def covariances(arrays: SplatArrays) -> np.ndarray:
+    """[M, 3, 3], float64."""
+    turns = np.stack([rotation_from_quaternion(q) for q in normalized(arrays.quaternions)])
+    factors = turns * np.exp(arrays.log_scales.astype(np.float64))[:, None]
+    return factors @ factors.transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_flag_of_antialiased_splats_is_written_and_read(made, tmp_path: Path, version: int) -> None:
+    path = tmp_path / "a.spz"
+    for antialiased in (False, True):
+        data = spz.encoded(replace(made(3), antialiased=antialiased), version)
+        path.write_bytes(data)
+        header = data if version == 4 else gzip.decompress(data)
+        assert header[14] == antialiased
+        assert spz.read(path).antialiased is antialiased
 
 
 @pytest.mark.skipif(zstandard is None, reason="zstandard is not installed")
@@ -263,6 +382,4 @@ def test_arrays_are_read_as_they_are_for_a_model(made, tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
     path.write_bytes(spz.encoded(made(3, 2)))
     arrays: SplatArrays = spz.read(path)
-    assert {array.dtype for name, array in vars(arrays).items() if name != "world_offset"} == {
-        np.dtype(np.float32)
-    }
+    assert {array.dtype for array in arrays.columns.values()} == {np.dtype(np.float32)}

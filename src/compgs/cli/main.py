@@ -25,6 +25,7 @@ from compgs.cli.encode import Encode
 from compgs.cli.evaluate import Evaluate
 from compgs.cli.export import Export
 from compgs.cli.info import Info
+from compgs.cli.notes import notes_shown
 from compgs.cli.reconstruct import Reconstruct
 from compgs.cli.render import Render
 from compgs.cli.report import Report
@@ -111,7 +112,7 @@ def run(command: Command) -> int:
     """The exit code; unexpected exceptions, which are our mistakes, keep their traceback."""
     say_when_compiling()
     try:
-        with ended_on_request():
+        with ended_on_request(), notes_shown():
             command.run()
     except BrokenPipeError:
         raise

@@ -1,24 +1,30 @@
-"""What all formats do with splats: limits, conversions, and the check that a reader ends with.
+"""What all formats do with splats: limits, conversions, and which splats of a file are taken.
 
-A reader ends with `checked`, so that whatever a file says, a `SplatArrays` from it can be rendered.
+A reader ends with `drawable`, so that whatever a file says, a `SplatArrays` from it can be rendered.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from compgs.errors import SplatFileError
 from compgs.model.degrees import MAX_DEGREE, degree_of, harmonics_above_dc
 from compgs.model.splats import ORIGIN, SplatArrays, sigmoid
+from compgs.notes import note
 
 __all__ = [
     "MAX_DEGREE",
     "ORIGIN",
     "SplatArrays",
     "check_count",
-    "checked",
     "degree_of",
+    "drawable",
     "harmonics_above_dc",
+    "joined",
+    "log_scales",
     "logit",
     "normalized",
     "sigmoid",
@@ -28,6 +34,8 @@ MAX_LOG_SCALE = 88.0  # its exponential is the largest that float32 holds
 # Of a splat that has no extent along an axis: the smallest scale that float32 holds in full precision.
 FLAT_LOG_SCALE = float(np.log(np.finfo(np.float32).tiny))
 MOST_DEGREE_HELD = 4  # of harmonics in files; those above MAX_DEGREE are left out
+# Of quaternions, whose squares float32 holds.
+SHORTEST, LONGEST = 1e-15, 1e15
 Y0 = 0.28209479177387814  # the harmonic of degree 0: sqrt(1 / 4 pi)
 COLOR_OFFSET = 0.5  # of a color, where all coefficients are zero
 # An opacity of 8 bits is 0 or 1 at its ends, of which there is no finite logit.
@@ -59,24 +67,100 @@ def check_count(place: Path, count: int, size: int) -> None:
         raise SplatFileError(f"{place}: promises {count} splats in {size} bytes; copy it again")
 
 
-def checked(place: Path, arrays: SplatArrays) -> SplatArrays:
-    """The same. Raises SplatFileError for the first number that nothing can be rendered from."""
-    for name, array in vars(arrays).items():
-        if name == "world_offset":
-            continue
-        bad = ~np.isfinite(array).reshape(len(array), -1)
-        if name == "log_scales":
-            bad |= array > MAX_LOG_SCALE
-        if bad.any():
-            row, column = (int(i) for i in np.argwhere(bad)[0])
-            found = array.reshape(len(array), -1)[row, column]
-            raise SplatFileError(
-                f"{place}: {name} of splat {row} hold {found}, expected a finite number"
-                f"{f' up to {MAX_LOG_SCALE:g}' if name == 'log_scales' else ''}; copy it again"
-            )
-    zero = np.flatnonzero(~arrays.quaternions.any(1))
-    if len(zero):
+def drawable(place: Path, arrays: SplatArrays) -> SplatArrays:
+    """The splats of a file that can be drawn: what every reader ends with.
+
+    | in the file | read as |
+    |---|---|
+    | the logit of an opacity is infinite | opaque, or invisible |
+    | a logarithm of an extent is minus infinity | flat: the smallest extent |
+    | a rotation is very long or very short | the same rotation |
+    | a rotation of zero; not-a-number; an infinite position, color, rotation; an extent above exp(88) | left out |
+
+    What is left out is counted in one note. Raises SplatFileError where that is most of the file.
+    """
+    arrays = _with_limits(arrays)
+    reasons = _reasons(arrays)
+    wrong = np.logical_or.reduce(list(reasons.values()))
+    left_out = int(wrong.sum())
+    if not left_out:
+        return arrays
+    counted = np.zeros(len(arrays), bool)
+    parts = []
+    for reason, rows in reasons.items():
+        new = rows & ~counted  # a splat counts once, by the first thing that is wrong with it
+        counted |= rows
+        if new.any():
+            parts.append(f"{new.sum():,} {reason} (the first is splat {int(np.argmax(new))})")
+    found = "; ".join(parts)
+    if 2 * left_out > len(arrays):
         raise SplatFileError(
-            f"{place}: the quaternion of splat {zero[0]} is zero, which is no rotation; copy it again"
+            f"{place}: {left_out:,} of {len(arrays):,} splats cannot be drawn: {found}; the training or the export "
+            "that made the file failed: repeat it"
         )
-    return arrays
+    note(place, f"{left_out:,} of {len(arrays):,} splats were left out: {found}")
+    return arrays.rows(~wrong)
+
+
+def _with_limits(arrays: SplatArrays) -> SplatArrays:
+    """With finite numbers in place of infinite ones that mean something; itself where there are none."""
+    logits, scales, quaternions = arrays.opacity_logits, arrays.log_scales, arrays.quaternions
+    if np.isinf(logits).any():
+        most = logit(np.ones(1))[0]
+        logits = np.where(np.isinf(logits), np.copysign(most, logits), logits)
+    if np.isneginf(scales).any():
+        scales = np.where(np.isneginf(scales), np.float32(FLAT_LOG_SCALE), scales)
+    largest = np.abs(quaternions).max(1)
+    odd = ((largest < SHORTEST) | (largest > LONGEST)) & (largest > 0) & np.isfinite(largest)
+    if odd.any():
+        quaternions = quaternions.copy()
+        quaternions[odd] = normalized(quaternions[odd])
+    same = logits is arrays.opacity_logits and scales is arrays.log_scales
+    if same and quaternions is arrays.quaternions:
+        return arrays
+    return replace(arrays, opacity_logits=logits, log_scales=scales, quaternions=quaternions)
+
+
+def _reasons(arrays: SplatArrays) -> dict[str, np.ndarray]:
+    """Why which splats [M] bool cannot be drawn, in the order in which they are asked."""
+
+    def broken(*columns: np.ndarray) -> np.ndarray:
+        rows = np.zeros(len(arrays), bool)
+        for column in columns:
+            rows |= ~np.isfinite(column.reshape(len(column), -1)).all(1)
+        return rows
+
+    return {
+        "without a rotation (their quaternion is zero)": (arrays.quaternions == 0).all(1),
+        "without a position (not a finite number)": broken(arrays.means),
+        "without a size (not a number, or above exp(88))": broken(arrays.log_scales)
+        | (arrays.log_scales > MAX_LOG_SCALE).any(1),
+        "without a rotation (not a finite number)": broken(arrays.quaternions),
+        "without an opacity (not a number)": broken(arrays.opacity_logits),
+        "without a color (not a finite number)": broken(arrays.dc, arrays.rest),
+    }
+
+
+def log_scales(scales: np.ndarray) -> np.ndarray:
+    """Logarithms of extents, float32: of zero minus infinity, of what is below zero not-a-number."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(scales.astype(np.float32))
+
+
+def joined(parts: Sequence[SplatArrays]) -> SplatArrays:
+    """Splats of several places of a file, in the frame of the first."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    degree = max(part.degree for part in parts)
+    coefficients = harmonics_above_dc(degree)
+
+    def moved(part: SplatArrays) -> SplatArrays:
+        shift = np.subtract(part.world_offset, first.world_offset)
+        rest = np.zeros((len(part), coefficients, 3), np.float32)
+        rest[:, : part.rest.shape[1]] = part.rest
+        return replace(part, means=(part.means + shift).astype(np.float32), rest=rest)
+
+    rows = [moved(part).columns for part in parts]
+    columns: dict[str, Any] = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+    return replace(first, **columns)

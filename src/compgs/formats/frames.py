@@ -1,7 +1,7 @@
 """Splats in another frame: axes that point elsewhere, and rotations, with their harmonics.
 
-The world here has COLMAP's axes (x right, y down, z forward), as files of 3DGS do. Two other conventions are half a
-turn away, so that going there and back loses nothing: only signs change.
+The world here has COLMAP's axes (x right, y down, z forward), as files of 3DGS do. Where other axes lie along these,
+only signs change, so that going there and back loses nothing.
 
 | convention | x, y, z | half a turn about | files |
 |---|---|---|---|
@@ -25,18 +25,42 @@ _ODD_IN = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "
 
 
 def turned(arrays: SplatArrays, signs: tuple[int, int, int]) -> SplatArrays:
-    """Splats after half a turn about an axis: two of the three signs are -1. Its own inverse, to the bit."""
-    assert np.prod(signs) == 1 and set(signs) <= {1, -1}, signs
+    """Splats where some axes point the other way: of two, half a turn; of one or three, a mirror. Its own inverse, to
+    the bit."""
+    assert set(signs) <= {1, -1}, signs
     s = np.array(signs, np.float32)
     odd = [np.prod([s["xyz".index(axis)] for axis in axes]) for axes in _ODD_IN]
     return replace(
         arrays,
         means=arrays.means * s,
-        # D R D in place of D R: the ellipsoid R S^2 R^T is the same, for D S D = S.
-        quaternions=arrays.quaternions * np.append(np.float32(1), s),
+        # D R D in place of D R: the ellipsoid R S^2 R^T is the same, for D S D = S. It turns also where D mirrors.
+        quaternions=arrays.quaternions * np.append(np.float32(1), np.prod(s) * s),
         rest=arrays.rest * np.array(odd, np.float32)[: arrays.rest.shape[1], None],
         world_offset=tuple((np.array(arrays.world_offset) * s + 0.0).tolist()),
     )
+
+
+# Where a letter points to, along which of the axes here.
+_DIRECTIONS = {
+    "R": (1, 0, 0),
+    "L": (-1, 0, 0),
+    "D": (0, 1, 0),
+    "U": (0, -1, 0),
+    "F": (0, 0, 1),
+    "B": (0, 0, -1),
+}
+
+
+def from_axes(arrays: SplatArrays, letters: str) -> SplatArrays:
+    """Splats whose x, y, z point to what the letters name (Right, Left, Up, Down, Front, Back), in the axes here."""
+    linear = np.array([_DIRECTIONS[letter] for letter in letters]).T
+    if not np.any(linear - np.diag(np.diag(linear))):
+        x, y, z = (int(sign) for sign in np.diag(linear))
+        return turned(arrays, (x, y, z))
+    side = round(float(np.linalg.det(linear)))
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear * (side, 1, 1)  # a rotation: of left-handed axes, x is turned over first
+    return transformed(turned(arrays, (side, 1, 1)), matrix)
 
 
 def transformed(arrays: SplatArrays, matrix: np.ndarray) -> SplatArrays:

@@ -2,7 +2,8 @@
 
     "glTF" | 2 | bytes of the file | JSON chunk | BIN chunk
 
-The JSON has one mesh of one primitive of points, whose attributes are columns of float32 in the BIN chunk:
+The JSON has one mesh of one primitive of points, whose attributes are columns of float32 in the BIN chunk; the reader
+takes any number of them, each as often as nodes of the scene place it:
 
 | attribute | value |
 |---|---|
@@ -14,12 +15,14 @@ The JSON has one mesh of one primitive of points, whose attributes are columns o
 | KHR_gaussian_splatting:SH_DEGREE_l_COEF_n | harmonics, red green blue |
 
 Axes are left, up, forward. The reader takes columns of smaller integers where the extension allows them, and a mesh
-that its nodes rotate, move and scale evenly.
+that its nodes rotate, mirror, move and scale evenly. There is no place for `SplatArrays.antialiased`. What else a file
+says of its picture is refused (`_attributes`, `_places`) or told in a note (`_passed_over`).
 """
 
 import json
 import struct
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +34,15 @@ from compgs.formats.arrays import (
     MAX_DEGREE,
     Y0,
     SplatArrays,
-    checked,
+    check_count,
+    drawable,
+    joined,
+    log_scales,
     logit,
     normalized,
 )
 from compgs.formats.frames import LEFT_UP_FORWARD, transformed, turned
+from compgs.notes import note
 from compgs.numerics.rotations import rotation_from_quaternion
 
 MAGIC = b"glTF"
@@ -48,11 +55,18 @@ _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _PARTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _DEEPEST = 64  # nodes inside nodes
 _EVEN = 1e-4  # relative difference of lengths that is rounding
+_MOST_PLACEMENTS = 4096  # of splats by nodes
+_INSTANCES = "EXT_mesh_gpu_instancing"
+# Of the extension: what is drawn here. Who does not know another may ignore it.
+_HINTS = {"kernel": "ellipse", "projection": "perspective", "sortingMethod": "cameraDistance"}
 
 
 def harmonic_names(degree: int) -> list[str]:
     """Attributes of degree 0 to `degree`, in the order of the coefficients."""
     return [f"{EXTENSION}:SH_DEGREE_{l}_COEF_{n}" for l in range(degree + 1) for n in range(2 * l + 1)]
+
+
+_HARMONICS = harmonic_names(MAX_DEGREE)
 
 
 # writing -----------------------------------------------------------------------------------------------------------
@@ -132,14 +146,23 @@ def _gltf(arrays: SplatArrays, columns: dict[str, np.ndarray]) -> dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
+class Placement:
+    """One place that nodes give the splats of one primitive."""
+
+    primitive: int
+    matrix: np.ndarray  # [4, 4] of the nodes above the mesh
+
+
+@dataclass(frozen=True, eq=False)
 class GlbFile:
     """A file's two chunks, and where in the JSON the splats are."""
 
     place: Path
     gltf: dict[str, Any]
     data: memoryview  # the BIN chunk
-    attributes: dict[str, int]  # accessors by name
-    matrix: np.ndarray  # [4, 4] of the nodes above the mesh
+    primitives: tuple[dict[str, int], ...]  # accessors by attribute, of those with splats
+    placements: tuple[Placement, ...]  # one at least
+    passed_over: tuple[str, ...]  # what the file says or shows, and nothing here uses
 
 
 def begins(head: bytes) -> bool:
@@ -155,25 +178,27 @@ def check(path: Path) -> None:
 def read(path: Path) -> SplatArrays:
     """Raises SplatFileError."""
     file = _open(path)
-    degree = max((d for d in range(MAX_DEGREE + 1) if harmonic_names(d)[-1] in file.attributes), default=0)
-    means = _column(file, "POSITION", 3)
-    harmonics = [_column(file, name, 3) for name in harmonic_names(degree)]
-    scales = _column(file, f"{EXTENSION}:SCALE", 3)
-    if not (scales >= 0).all():
-        raise SplatFileError(f"{path}: {EXTENSION}:SCALE: expected positive numbers")
-    columns = {
-        "quaternions": np.roll(_column(file, f"{EXTENSION}:ROTATION", 4), 1, axis=1),
-        "opacity_logits": logit(_column(file, f"{EXTENSION}:OPACITY", 1)[:, 0]),
-        "log_scales": np.log(np.maximum(scales, np.finfo(np.float32).tiny)),
+    splats = [_splats(file, attributes) for attributes in file.primitives]
+    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is left out in the end
+        parts = [_placed(path, splats[each.primitive], each.matrix) for each in file.placements]
+    if file.passed_over:
+        note(path, f"not used: {', '.join(file.passed_over)}")
+    return turned(drawable(path, joined(parts)), LEFT_UP_FORWARD)
+
+
+def _splats(file: GlbFile, attributes: dict[str, int]) -> SplatArrays:
+    """Of one primitive, in the frame of its mesh."""
+    degree = max((d for d in range(MAX_DEGREE + 1) if harmonic_names(d)[-1] in attributes), default=0)
+    means = _column(file, attributes, "POSITION", 3)
+    harmonics = [_column(file, attributes, name, 3) for name in harmonic_names(degree)]
+    columns: dict[str, Any] = {
+        "quaternions": np.roll(_column(file, attributes, f"{EXTENSION}:ROTATION", 4), 1, axis=1),
+        "opacity_logits": logit(_column(file, attributes, f"{EXTENSION}:OPACITY", 1)[:, 0]),
+        "log_scales": log_scales(_column(file, attributes, f"{EXTENSION}:SCALE", 3)),
         "dc": harmonics[0],
         "rest": np.stack(harmonics[1:], 1) if degree else np.zeros((len(means), 0, 3), np.float32),
     }
-    if {len(column) for column in columns.values()} != {len(means)}:
-        raise SplatFileError(f"{path}: its attributes are of different numbers of splats")
-    found = checked(path, SplatArrays(means, **columns))
-    if not np.array_equal(file.matrix[:3, :3], np.eye(3)) or file.matrix[:3, 3].any():
-        found = checked(path, _placed(file, found))
-    return turned(found, LEFT_UP_FORWARD)
+    return SplatArrays(means, **columns)
 
 
 def component_bytes(path: Path) -> dict[str, int]:
@@ -181,14 +206,14 @@ def component_bytes(path: Path) -> dict[str, int]:
     file = _open(path)
     labels = {"POSITION": "positions", "ROTATION": "rotations", "SCALE": "scales", "OPACITY": "opacities"}
     sizes: dict[str, int] = {}
-    for name in file.attributes:
-        last = name.rpartition(":")[2]
-        label = (
-            "colors" if last == "SH_DEGREE_0_COEF_0" else "harmonics" if last.startswith("SH_") else "others"
-        )
-        label = labels.get(last, label)
-        dtype, parts, count = _layout(file, name)[:3]
-        sizes[label] = sizes.get(label, 0) + dtype.itemsize * parts * count
+    for attributes in file.primitives:
+        for name in attributes:
+            last = name.rpartition(":")[2]
+            color = last == "SH_DEGREE_0_COEF_0"
+            label = "colors" if color else "harmonics" if last.startswith("SH_") else "others"
+            label = labels.get(last, label)
+            dtype, parts, count = _layout(file, attributes, name)[:3]
+            sizes[label] = sizes.get(label, 0) + dtype.itemsize * parts * count
     return {"header": path.stat().st_size - sum(sizes.values()), **sizes}
 
 
@@ -214,62 +239,125 @@ def _open(path: Path) -> GlbFile:
             raise SplatFileError(f"{path}: its second chunk is not whole; copy it again")
         data = memoryview(content)[28 + text_size : 28 + text_size + length]
     try:
-        attributes, matrix = _find_splats(path, gltf)
-        file = GlbFile(path, gltf, data, attributes, matrix)
-        needed = ["POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))]
-        for name in [*needed, *harmonic_names(0)]:
-            if name not in attributes:
-                raise SplatFileError(f"{path}: attribute {name} is missing")
-        counts = {_layout(file, name)[2] for name in attributes}
+        primitives, placements = _find_splats(path, gltf)
+        file = GlbFile(path, gltf, data, primitives, placements, _passed_over(gltf))
+        counts = [_checked_count(file, attributes) for attributes in primitives]
+        check_count(path, sum(counts[each.primitive] for each in placements), len(content))
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise SplatFileError(
             f"{path}: its JSON does not describe splats ({type(error).__name__}: {error})"
         ) from error
-    if len(counts) != 1 or counts == {0}:
-        raise SplatFileError(f"{path}: expected attributes of one number of splats, found {sorted(counts)}")
     return file
 
 
-def _find_splats(path: Path, gltf: dict[str, Any]) -> tuple[dict[str, int], np.ndarray]:
-    """The attributes of the one primitive of splats, and the matrix of its place in the scene."""
+def _checked_count(file: GlbFile, attributes: dict[str, int]) -> int:
+    """How many splats. Raises SplatFileError unless all that they need is there, for one number of them."""
+    needed = ["POSITION", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))]
+    for name in [*needed, *harmonic_names(0)]:
+        if name not in attributes:
+            raise SplatFileError(f"{file.place}: attribute {name} is missing")
+    counts = {_layout(file, attributes, name)[2] for name in attributes}
+    if len(counts) != 1 or counts == {0}:
+        raise SplatFileError(
+            f"{file.place}: expected attributes of one number of splats, found {sorted(counts)}"
+        )
+    return counts.pop()
+
+
+def _find_splats(
+    path: Path, gltf: dict[str, Any]
+) -> tuple[tuple[dict[str, int], ...], tuple[Placement, ...]]:
+    """Every primitive of splats, and each place that the scene gives it."""
     foreign = sorted(set(gltf.get("extensionsRequired", [])) - {EXTENSION})
     if foreign:
         raise SplatFileError(f"{path}: needs the extension {foreign[0]}, which is not read here")
-    found = [
-        (mesh, primitive)
-        for mesh, content in enumerate(gltf.get("meshes", []))
-        for primitive in content["primitives"]
-        if EXTENSION in primitive.get("extensions", {})
-    ]
-    if len(found) != 1:
-        raise SplatFileError(f"{path}: holds {len(found)} sets of splats ({EXTENSION}), expected one")
-    mesh, primitive = found[0]
-    space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
+    primitives: list[dict[str, int]] = []
+    of_mesh: dict[int, list[int]] = {}
+    for mesh, content in enumerate(gltf.get("meshes", [])):
+        for primitive in content["primitives"]:
+            if EXTENSION in primitive.get("extensions", {}):
+                of_mesh.setdefault(mesh, []).append(len(primitives))
+                primitives.append(_attributes(path, primitive))
+    if not primitives:
+        raise SplatFileError(f"{path}: holds no splats ({EXTENSION})")
+    placements: list[Placement] = []
+    for mesh, matrix in _places(path, gltf):
+        placements += [Placement(number, matrix) for number in of_mesh.get(mesh, [])]
+        if len(placements) > _MOST_PLACEMENTS:
+            raise SplatFileError(f"{path}: places splats more than {_MOST_PLACEMENTS} times")
+    if not placements:
+        raise SplatFileError(f"{path}: its splats are in no scene")
+    return tuple(primitives), tuple(placements)
+
+
+def _attributes(path: Path, primitive: dict[str, Any]) -> dict[str, int]:
+    """Accessors by name. Raises SplatFileError for splats that are drawn or packed in a way that is not known here."""
+    extension = primitive["extensions"][EXTENSION]
+    space = extension.get("colorSpace", COLOR_SPACE)
     if space != COLOR_SPACE:
         raise SplatFileError(f"{path}: colors in {space}; expected {COLOR_SPACE}")
+    inner = sorted(extension.get("extensions", {}))
     attributes = dict(primitive["attributes"])
+    if inner and f"{EXTENSION}:ROTATION" not in attributes:
+        raise SplatFileError(
+            f"{path}: its splats are packed by the extension {inner[0]}, which is not read here; export them without it"
+        )
     if not all(type(index) is int and index >= 0 for index in attributes.values()):
         raise SplatFileError(f"{path}: attributes are named by {attributes}, expected numbers of accessors")
-    return attributes, _place(path, gltf, mesh)
+    return attributes
 
 
-def _place(path: Path, gltf: dict[str, Any], mesh: int) -> np.ndarray:
-    """[4, 4] product of the nodes from the scene down to a mesh."""
+def _passed_over(gltf: dict[str, Any]) -> tuple[str, ...]:
+    """What a file says of its splats, or shows beside them, that nothing here uses."""
+    found: list[str] = []
+    others = 0
+    used = {"POSITION", "COLOR_0", *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))}
+    for primitive in (primitive for mesh in gltf["meshes"] for primitive in mesh["primitives"]):
+        extension = primitive.get("extensions", {}).get(EXTENSION)
+        if extension is None:
+            others += 1
+            continue
+        for name, known in _HINTS.items():
+            if extension.get(name, known) != known:
+                found.append(f"{name} {extension[name]!r:.40} (drawn as {known})")
+        found += [f"extension {name}" for name in sorted(extension.get("extensions", {}))]
+        found += [f"attribute {name}" for name in primitive["attributes"] if name not in {*used, *_HARMONICS}]
+        found += ["morph targets"] if "targets" in primitive else []
+    found += [f"{others} meshes of triangles, lines or points"] if others else []
+    found += [name for name in ("animations", "skins") if gltf.get(name)]
+    return tuple(dict.fromkeys(found))
+
+
+def _places(path: Path, gltf: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]]:
+    """Each node that has a mesh: which one, and the product [4, 4] of the nodes from the scene down to it."""
     nodes = gltf.get("nodes", [])
     scenes = gltf.get("scenes", [])
-    roots = scenes[gltf.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
-    waiting = [(index, np.eye(4), 0) for index in roots]
+    roots = scenes[gltf.get("scene", 0)].get("nodes", []) if scenes else _roots(nodes)
+    waiting = [(index, np.eye(4), 0) for index in reversed(roots)]
     visited = set()
     while waiting:
         index, above, depth = waiting.pop()
         if depth > _DEEPEST or index in visited or index < 0:
             raise SplatFileError(f"{path}: its nodes are not a tree")
         visited.add(index)
-        here = above @ _node_matrix(nodes[index])
-        if nodes[index].get("mesh") == mesh:
-            return here
-        waiting += [(child, here, depth + 1) for child in nodes[index].get("children", [])]
-    raise SplatFileError(f"{path}: its splats are in no scene")
+        node = nodes[index]
+        extensions = node.get("extensions", {})
+        if extensions.get("KHR_node_visibility", {}).get("visible", True) is False:
+            continue
+        here = above @ _node_matrix(node)
+        if "mesh" in node:
+            if _INSTANCES in extensions:
+                raise SplatFileError(
+                    f"{path}: node {index} places its mesh by {_INSTANCES}, which is not read here"
+                )
+            yield node["mesh"], here
+        waiting += [(child, here, depth + 1) for child in reversed(node.get("children", []))]
+
+
+def _roots(nodes: list[dict[str, Any]]) -> list[int]:
+    """Of a file without scenes: nodes that are no other's children."""
+    children = {child for node in nodes for child in node.get("children", [])}
+    return [index for index in range(len(nodes)) if index not in children]
 
 
 def _node_matrix(node: dict[str, Any]) -> np.ndarray:
@@ -289,25 +377,27 @@ def _node_matrix(node: dict[str, Any]) -> np.ndarray:
     return matrix
 
 
-def _placed(file: GlbFile, arrays: SplatArrays) -> SplatArrays:
-    """Where the nodes put the splats. Raises SplatFileError for a scale that is not even."""
-    linear = file.matrix[:3, :3]
+def _placed(path: Path, arrays: SplatArrays, matrix: np.ndarray) -> SplatArrays:
+    """Where the nodes put splats. Raises SplatFileError for a scale that is not even."""
+    linear = matrix[:3, :3]
     if np.array_equal(linear, np.eye(3)):
-        return SplatArrays(**{**vars(arrays), "world_offset": tuple(file.matrix[:3, 3].tolist())})
+        return replace(arrays, world_offset=tuple(matrix[:3, 3].tolist()))
     determinant = float(np.linalg.det(linear))
-    even = determinant > 0 and np.allclose(
-        linear @ linear.T, np.eye(3) * determinant ** (2 / 3), rtol=0, atol=_EVEN * determinant ** (2 / 3)
-    )
-    if not even:
-        raise SplatFileError(
-            f"{file.place}: its node stretches or mirrors the splats, which is not read here"
-        )
-    return transformed(arrays, file.matrix)
+    square = abs(determinant) ** (2 / 3)
+    if not (square > 0 and np.allclose(linear @ linear.T, np.eye(3) * square, rtol=0, atol=_EVEN * square)):
+        raise SplatFileError(f"{path}: its node stretches the splats, which is not read here")
+    if determinant > 0:
+        return transformed(arrays, matrix)
+    mirrored = matrix.copy()
+    mirrored[:3, 0] *= -1  # what remains is a rotation, of splats that are mirrored first
+    return transformed(turned(arrays, (-1, 1, 1)), mirrored)
 
 
-def _layout(file: GlbFile, name: str) -> tuple[np.dtype, int, int, int, int, bool]:
+def _layout(
+    file: GlbFile, attributes: dict[str, int], name: str
+) -> tuple[np.dtype, int, int, int, int, bool]:
     """Type, parts, rows, first byte, bytes from row to row, and whether integers are parts of their largest."""
-    accessor = file.gltf["accessors"][file.attributes[name]]
+    accessor = file.gltf["accessors"][attributes[name]]
     view = file.gltf["bufferViews"][accessor["bufferView"]]
     if "sparse" in accessor or view.get("buffer", 0) != 0 or "uri" in file.gltf["buffers"][0]:
         raise SplatFileError(f"{file.place}: {name} is sparse or in another file, which is not read here")
@@ -324,11 +414,11 @@ def _layout(file: GlbFile, name: str) -> tuple[np.dtype, int, int, int, int, boo
     return dtype, parts, count, start + inside, stride, bool(accessor.get("normalized", False))
 
 
-def _column(file: GlbFile, name: str, parts: int) -> np.ndarray:
+def _column(file: GlbFile, attributes: dict[str, int], name: str, parts: int) -> np.ndarray:
     """[M, parts] float32."""
-    if name not in file.attributes:
+    if name not in attributes:
         raise SplatFileError(f"{file.place}: attribute {name} is missing")
-    dtype, found, count, start, stride, fraction = _layout(file, name)
+    dtype, found, count, start, stride, fraction = _layout(file, attributes, name)
     if found != parts:
         raise SplatFileError(f"{file.place}: {name} has {found} parts, expected {parts}")
     rows = np.ndarray((count, parts), dtype, file.data, start, (stride, dtype.itemsize))

@@ -28,7 +28,7 @@ import numpy as np
 
 from compgs.devices import placed
 from compgs.errors import SplatFileError
-from compgs.formats.arrays import SplatArrays, checked
+from compgs.formats.arrays import SplatArrays, drawable
 from compgs.outputs import write_bytes
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def splat_model(
 
     if not len(arrays):
         raise SplatFileError(f"{packed.path}: holds no splats")
-    return placed(SplatModel(checked(packed.path, arrays), background), device)
+    return placed(SplatModel(drawable(packed.path, arrays), background), device)
 
 
 def _header(path: Path, data: bytes) -> tuple[dict[str, Any], list[_Entry]]:

@@ -10,26 +10,35 @@
 | scale_0 ... 2 | log of the standard deviations, world units; 2DGS has two, its splats are flat |
 | rot_0 ... 3 | quaternion w-x-y-z, not normalized |
 
-Little endian, in this order. The reader takes properties in any order and ignores others (and elements after the
-vertices); what it needs must be there, in single or double precision, finite, and as many rows as the header promises.
-Harmonics of degree 4 are left out. Text is read by `ply_text`, SuperSplat's packed layout by `ply_compressed`.
+Little endian, in this order. `comment SplatRenderMode: mip` in the header (Brush) says that the splats are
+antialiased; the reader takes `comment antialiased 1` (Postshot), too.
+
+The reader takes properties in any order; what it needs must be there, in single or double precision, and as many rows
+as the header promises. In place of f_dc it takes red, green, blue (nerfstudio), and with them `filter_3D`
+(Mip-Splatting): the width of a smoothing filter that widens a splat and dilutes its opacity. What it does not use,
+harmonics of degree 4, other properties and elements after the vertices, is named in a note. Text is read by `ply_text`,
+SuperSplat's packed layout by `ply_compressed`.
 """
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from compgs.errors import SplatFileError
 from compgs.formats.arrays import (
+    COLOR_OFFSET,
     FLAT_LOG_SCALE,
     MAX_DEGREE,
-    MAX_LOG_SCALE,
     MOST_DEGREE_HELD,
+    Y0,
     SplatArrays,
+    drawable,
     harmonics_above_dc,
+    logit,
 )
+from compgs.notes import note
 from compgs.outputs import check_output_file, write_bytes
 
 MAX_HEADER_BYTES = 1 << 16
@@ -46,6 +55,13 @@ TYPES = {
 }
 THIRD_SCALE = "scale_2"  # which the flat splats of 2DGS lack
 _REMEDY = "export the scene again as an uncompressed 3DGS .ply"
+_ANTIALIASED = "comment SplatRenderMode: mip"
+# In place of harmonics of degree 0: bytes, or numbers from 0 to 1.
+_DISPLAY_COLORS = ("red", "green", "blue")
+_BRIGHTEST = 2.0  # of colors from 0 to 1; floating-point colors above it are parts of 255
+_FILTER = "filter_3D"
+# Of viewers of points; what they say is elsewhere in the file, or nowhere used.
+_FOR_POINTS = ("nx", "ny", "nz", *_DISPLAY_COLORS, "alpha")
 
 
 def numbered(name: str, count: int) -> tuple[str, ...]:
@@ -76,6 +92,8 @@ class PlyHeader:
     start: int  # bytes before the first vertex
     bytes: int  # of the whole file
     held_degree: int  # of the harmonics in the file, which may be more than are read
+    antialiased: bool
+    elements: tuple[str, ...]  # that follow the vertices
 
 
 # writing -----------------------------------------------------------------------------------------------------------
@@ -112,7 +130,7 @@ def encoded(arrays: SplatArrays) -> bytes:
     for group, values in content.items():
         first = names.index(groups[group][0]) if groups[group] else 0
         table[:, first : first + len(groups[group])] = values
-    return _header_text(len(arrays), names) + table.tobytes()
+    return _header_text(len(arrays), names, antialiased=arrays.antialiased) + table.tobytes()
 
 
 def ply_size(count: int, degree: int) -> int:
@@ -121,8 +139,10 @@ def ply_size(count: int, degree: int) -> int:
     return len(_header_text(count, names)) + 4 * len(names) * count
 
 
-def _header_text(count: int, names: list[str]) -> bytes:
-    lines = ["ply", FORMAT, f"element vertex {count}", *(f"property float {name}" for name in names)]
+def _header_text(count: int, names: list[str], *, antialiased: bool = False) -> bytes:
+    comments = [_ANTIALIASED] if antialiased else []
+    properties = (f"property float {name}" for name in names)
+    lines = ["ply", FORMAT, *comments, f"element vertex {count}", *properties]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
@@ -151,37 +171,78 @@ def read(path: Path) -> SplatArrays:
 
 
 def splats_of(path: Path, header: PlyHeader, table: np.ndarray) -> SplatArrays:
-    """From the vertices, a structured array [count]. Raises SplatFileError."""
+    """From the vertices, a structured array [count]. Raises SplatFileError where most of them cannot be drawn."""
     groups = property_groups(header.held_degree)
+    held = header.row.names or ()
 
-    def values(group: str) -> np.ndarray:
-        names = groups[group]
+    def values(names: tuple[str, ...]) -> np.ndarray:
         array = np.empty((header.count, len(names)), np.float32)
-        with np.errstate(over="ignore"):  # a double that is too large becomes infinite, and is refused
+        with np.errstate(over="ignore"):  # a double that is too large becomes infinite
             for i, name in enumerate(names):
-                if name not in (header.row.names or ()):  # only the third scale may be missing
-                    array[:, i] = FLAT_LOG_SCALE
-                    continue
-                array[:, i] = table[name]
-                _check_numbers(path, name, array[:, i])
+                # Only the third scale may be missing.
+                array[:, i] = table[name] if name in held else FLAT_LOG_SCALE
         return array
 
-    log_scales, quaternions = values("scales"), values("rotations")
-    zero = np.flatnonzero(~quaternions.any(1))
-    if len(zero):
-        raise SplatFileError(
-            f"{path}: rot_0 to rot_3 of splat {zero[0]} are all zero, which is no rotation; {_REMEDY}"
-        )
-    harmonics = values("harmonics").reshape(header.count, 3, harmonics_above_dc(header.held_degree))
+    harmonics = values(groups["harmonics"]).reshape(header.count, 3, harmonics_above_dc(header.held_degree))
     kept = harmonics[:, :, : harmonics_above_dc(header.degree)]
-    return SplatArrays(
-        means=values("positions"),
-        log_scales=log_scales,
-        quaternions=quaternions,
-        opacity_logits=values("opacities")[:, 0].copy(),
-        dc=values("colors"),
+    displayed = groups["colors"][0] not in held
+    found = SplatArrays(
+        means=values(groups["positions"]),
+        log_scales=values(groups["scales"]),
+        quaternions=values(groups["rotations"]),
+        opacity_logits=values(groups["opacities"])[:, 0].copy(),
+        dc=_coefficients(header, values(_DISPLAY_COLORS)) if displayed else values(groups["colors"]),
         rest=np.ascontiguousarray(kept.transpose(0, 2, 1)),
+        antialiased=header.antialiased,
     )
+    if _FILTER in held:
+        found = _smoothed(found, values((_FILTER,)))
+    _tell_unused(path, header)
+    return drawable(path, found)
+
+
+def _coefficients(header: PlyHeader, colors: np.ndarray) -> np.ndarray:
+    """Harmonics of degree 0 [M, 3] of display colors [M, 3]: parts of the largest integer, or of one."""
+    kind = header.row[_DISPLAY_COLORS[0]]
+    whole = np.iinfo(kind).max if kind.kind in "iu" else 1
+    if whole == 1 and np.fmax.reduce(colors, axis=None) > _BRIGHTEST:
+        whole = np.iinfo(np.uint8).max
+    return ((colors / np.float32(whole) - np.float32(COLOR_OFFSET)) / np.float32(Y0)).astype(np.float32)
+
+
+def _smoothed(arrays: SplatArrays, widths: np.ndarray) -> SplatArrays:
+    """Splats convolved with a Gaussian of their own width [M, 1] in world units (Yu et al. 2024, Mip-Splatting, Eq. 9):
+
+        scale' = sqrt(scale^2 + width^2),  opacity' = opacity * product of scale / scale'
+
+    Who writes such widths renders antialiased.
+    """
+    before = arrays.log_scales.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):  # no width leaves a splat as it is
+        after = np.logaddexp(2 * before, 2 * np.log(np.abs(widths.astype(np.float64)))) / 2
+        share = np.exp((before - after).sum(1))
+    changed = (widths[:, 0] != 0) & np.isfinite(share)
+    return replace(
+        arrays,
+        log_scales=after.astype(np.float32),
+        opacity_logits=np.where(changed, logit(arrays.opacities * share), arrays.opacity_logits),
+        antialiased=True,
+    )
+
+
+def _tell_unused(path: Path, header: PlyHeader) -> None:
+    """A note of what the header names and nothing here uses."""
+    used = {name for group in property_groups(header.held_degree).values() for name in group}
+    others = [name for name in header.row.names or () if name not in {*used, *_FOR_POINTS, _FILTER}]
+    parts = [
+        f"{kind} {', '.join(names)}"
+        for kind, names in (("properties", others), ("elements", header.elements))
+        if names
+    ]
+    if header.held_degree > header.degree:
+        parts.insert(0, f"harmonics of degree {header.held_degree}")
+    if parts:
+        note(path, f"not used: {'; '.join(parts)}")
 
 
 def component_bytes(path: Path) -> dict[str, int]:
@@ -203,17 +264,35 @@ def component_bytes_of(header: PlyHeader) -> dict[str, int]:
 def read_ply_header(path: str | Path) -> PlyHeader:
     """Everything that can be known without reading the splats. Raises SplatFileError."""
     path = Path(path)
+    header = described(path, FORMAT)
+    promised = header.start + header.count * header.row.itemsize
+    if header.bytes < promised or (header.bytes > promised and not header.elements):
+        raise SplatFileError(
+            f"{path}: {header.count} splats of {header.row.itemsize} bytes are {promised} bytes with the header, "
+            f"the file has {header.bytes}; copy it again"
+        )
+    return header
+
+
+def described(path: Path, expected: str) -> PlyHeader:
+    """What a header says of splats, in a file of the format that is expected. Raises SplatFileError."""
     lines, start, size = header_lines(path)
-    count, columns, others = vertices(path, lines)
+    count, columns, others = vertices(path, lines, expected)
     row = np.dtype(columns)
     held = degree_held(path, row)
-    promised = start + count * row.itemsize
-    if size < promised or (size > promised and not others):
-        raise SplatFileError(
-            f"{path}: {count} splats of {row.itemsize} bytes are {promised} bytes with the header, "
-            f"the file has {size}; copy it again"
-        )
-    return PlyHeader(count, min(held, MAX_DEGREE), row, start, size, held)
+    return PlyHeader(count, min(held, MAX_DEGREE), row, start, size, held, antialiased(lines), others)
+
+
+def antialiased(lines: list[list[str]]) -> bool:
+    """What comments say of how the splats are drawn; the last one counts."""
+    found = False
+    for words in lines:
+        match [word.lower() for word in words]:
+            case ["comment", "splatrendermode:", mode]:
+                found = mode == "mip"
+            case ["comment", "antialiased", ("0" | "1") as digit]:
+                found = digit == "1"
+    return found
 
 
 def header_lines(path: Path) -> tuple[list[list[str]], int, int]:
@@ -238,12 +317,13 @@ def header_lines(path: Path) -> tuple[list[list[str]], int, int]:
 
 def vertices(
     path: Path, lines: list[list[str]], expected: str = FORMAT
-) -> tuple[int, list[tuple[str, str]], bool]:
-    """Number of vertices, names and types of their properties, and whether other elements follow.
+) -> tuple[int, list[tuple[str, str]], tuple[str, ...]]:
+    """Number of vertices, names and types of their properties, and the elements that follow.
 
     Raises SplatFileError for a header that says otherwise than a file of splats, or no splats.
     """
-    count, columns, element, others = -1, [], "", False
+    count, columns, element = -1, [], ""
+    others: tuple[str, ...] = ()
     for words in lines[1:]:
         if words[:1] == ["format"] and " ".join(words) != expected:
             raise SplatFileError(f"{path}: expected {expected!r}, found {' '.join(words)!r}; {_REMEDY}")
@@ -253,7 +333,7 @@ def vertices(
                 raise SplatFileError(
                     f"{path}: expected 'element vertex COUNT' first, found {' '.join(words)!r}; {_REMEDY}"
                 )
-            others = others or element != "vertex"
+            others += () if element == "vertex" else (element,)
             count = int(words[2]) if count < 0 else count
         elif words[:1] == ["property"] and element == "vertex":
             if len(words) != 3 or words[1] not in TYPES:
@@ -283,27 +363,28 @@ def degree_held(path: Path, row: np.dtype) -> int:
             f"(degree 0 to {MOST_DEGREE_HELD})"
         )
     groups = property_groups(degrees[held])
-    for group, names in groups.items():
-        for name in names:
-            if group == "normals" or (name == THIRD_SCALE and name not in found):
-                continue
-            if name not in found:
-                hint = "these are points, not splats" if "f_dc_0" not in found else _REMEDY
-                raise SplatFileError(f"{path}: property {name!r} is missing; {hint}")
-            if row[name].kind != "f":
-                raise SplatFileError(
-                    f"{path}: property {name!r} is of type {row[name]}, expected float or double"
-                )
+    if found.issuperset(_DISPLAY_COLORS) and found.isdisjoint(groups["colors"]):
+        groups["colors"] = _DISPLAY_COLORS
+    needed = [name for group, names in groups.items() if group != "normals" for name in names]
+    missing = [name for name in needed if name not in found]
+    if missing not in ([], [THIRD_SCALE]):
+        raise SplatFileError(f"{path}: {_what_is_missing(groups, missing)}")
+    for name in needed:
+        if name in found and name not in _DISPLAY_COLORS and row[name].kind != "f":
+            raise SplatFileError(
+                f"{path}: property {name!r} is of type {row[name]}, expected float or double"
+            )
     return degrees[held]
 
 
-def _check_numbers(path: Path, name: str, column: np.ndarray) -> None:
-    bad = ~np.isfinite(column)
-    if name.startswith("scale_"):
-        bad |= column > MAX_LOG_SCALE
-    if bad.any():
-        first = int(np.argmax(bad))
-        legal = f"a finite number up to {MAX_LOG_SCALE:g}" if name.startswith("scale_") else "a finite number"
-        raise SplatFileError(
-            f"{path}: {name} of splat {first} is {column[first]}, expected {legal}; {_REMEDY}"
+def _what_is_missing(groups: dict[str, tuple[str, ...]], missing: list[str]) -> str:
+    """In words, with a remedy for what the file seems to be."""
+    shape = {*groups["opacities"], *groups["scales"], *groups["rotations"]}
+    if shape <= set(missing):
+        return f"property {missing[0]!r} is missing: these are points, not splats"
+    if set(groups["colors"]) <= set(missing):
+        return (
+            f"its splats have no colors: expected properties {', '.join(groups['colors'])}, or "
+            f"{', '.join(_DISPLAY_COLORS)}; {_REMEDY}, with colors"
         )
+    return f"property {missing[0]!r} is missing; {_REMEDY}"

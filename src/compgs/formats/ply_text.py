@@ -7,7 +7,7 @@ import numpy as np
 
 from compgs.errors import SplatFileError
 from compgs.formats import ply
-from compgs.formats.arrays import MAX_DEGREE, SplatArrays
+from compgs.formats.arrays import SplatArrays
 
 FORMAT = "format ascii 1.0"
 _LEAST_BYTES = 2  # of a number: a digit, and a blank before the next
@@ -44,17 +44,15 @@ def component_bytes(path: Path) -> dict[str, int]:
 
 def _header(path: Path) -> ply.PlyHeader:
     """Checked against the size of the file."""
-    lines, start, size = ply.header_lines(path)
-    count, columns, _ = ply.vertices(path, lines, FORMAT)
-    row = np.dtype(columns)
-    held = ply.degree_held(path, row)
-    least = _LEAST_BYTES * count * len(columns) - 1  # nothing need follow the last number
-    if size - start < least:
+    header = ply.described(path, FORMAT)
+    count, size, width = header.count, header.bytes - header.start, len(header.row.names or ())
+    least = _LEAST_BYTES * count * width - 1  # nothing need follow the last number
+    if size < least:
         raise SplatFileError(
-            f"{path}: {count} splats of {len(columns)} numbers are at least {least} bytes of text, "
-            f"the file has {size - start}; copy it again"
+            f"{path}: {count} splats of {width} numbers are at least {least} bytes of text, the file has {size}; "
+            "copy it again"
         )
-    return ply.PlyHeader(count, min(held, MAX_DEGREE), row, start, size, held)
+    return header
 
 
 def _fill(numbers: np.ndarray, path: Path, file: BinaryIO, names: tuple[str, ...]) -> None:

@@ -120,7 +120,8 @@ def format_of(path: Path) -> Format:
     found = next((each for each in FORMATS if each.begins(head)), None)
     if found is None:
         what = f"is not a .cgs file, nor one of {names}" if head else "is empty"
-        raise NotACompGSFile(f"{path}: {what}")
+        hint = f"; {splat.doubt(head)}" if head and path.suffix.lower() == ".splat" else ""
+        raise NotACompGSFile(f"{path}: {what}{hint}")
     return found
 
 

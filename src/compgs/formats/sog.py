@@ -11,6 +11,9 @@ Pixel i, row by row, is splat i in every image but the palette's.
 | shN: centroids | RGB | a palette of the coefficients of degree 1 to `bands`: 64 entries a row, index in `codebook` |
 | shN: labels | RG | 16 bits: which entry |
 
+`antialias` in meta.json, and in newer files `"model": "antialiased"`, say that the splats are antialiased
+(`SplatArrays.antialiased`); both are written. What else meta.json says is named in a note.
+
 Axes are those of .ply files. There is no place for where positions count from: they are written as they are, in the
 model's own frame.
 """
@@ -32,15 +35,21 @@ from compgs.formats.arrays import (
     MAX_DEGREE,
     SplatArrays,
     check_count,
-    checked,
+    drawable,
     harmonics_above_dc,
     logit,
     normalized,
 )
 from compgs.formats.palette import codebook, palette
+from compgs.notes import note
 
 VERSION = 2
 META = "meta.json"
+PLAIN_MODEL, ANTIALIASED_MODEL = "default", "antialiased"  # by newer writers, in place of `antialias`
+KNOWN = {
+    "version", "count", "antialias", "model", "means", "scales", "quats", "sh0", "shN",
+    "asset", "extras",  # of who wrote it, and for applications: no picture depends on them
+}  # fmt: skip
 ZIP_MAGIC = b"PK\x03\x04"
 BOOK = 256  # entries of a codebook
 PALETTE_ROW = 64  # entries in a row of the palette's image
@@ -91,12 +100,14 @@ def _images(arrays: SplatArrays) -> tuple[dict[str, bytes], dict[str, Any]]:
         "version": VERSION,
         "asset": {"generator": "compgs"},
         "count": len(arrays),
-        "antialias": False,
+        "antialias": arrays.antialiased,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": _short(scale_book), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": _short(color_book), "files": ["sh0.webp"]},
     }
+    if arrays.antialiased:
+        meta["model"] = ANTIALIASED_MODEL
     if arrays.degree:
         files |= _harmonics(arrays, meta)
     return files, meta
@@ -198,15 +209,27 @@ def read(path: Path) -> SplatArrays:
     scales = _pixels(files, "scales", 0, 3)
     found = SplatArrays(
         means=_positions(files, low.astype(np.int64) + (high.astype(np.int64) << 8)),
-        log_scales=_numbers(files, "scales", "codebook", BOOK)[scales],
-        quaternions=_rotations(files, _pixels(files, "quats", 0, 4)),
+        log_scales=_codebook(files, "scales")[scales],
+        quaternions=_rotations(_pixels(files, "quats", 0, 4)),
         opacity_logits=logit(colors[:, 3] / 255),
-        dc=_numbers(files, "sh0", "codebook", BOOK)[colors[:, :3]],
+        dc=_codebook(files, "sh0")[colors[:, :3]],
         rest=np.zeros((files.count, 0, 3), np.float32),
+        antialiased=_antialiased(files),
     )
     if "shN" in files.meta:
         found = replace(found, rest=_palette_entries(files))
-    return checked(path, found)
+    return drawable(path, found)
+
+
+def _antialiased(files: SogFiles) -> bool:
+    """What meta.json says of how the splats are drawn; of what else it says and nothing here uses, a note."""
+    model = files.meta.get("model", PLAIN_MODEL)
+    unused = [name for name in files.meta if name not in KNOWN]
+    if model not in (PLAIN_MODEL, ANTIALIASED_MODEL):
+        unused.append(f"model {model!r:.40}: drawn as plain splats")
+    if unused:
+        note(files.place, f"{META}: not used: {', '.join(unused)}")
+    return model == ANTIALIASED_MODEL or files.meta.get("antialias") is True
 
 
 def component_bytes(path: Path) -> dict[str, int]:
@@ -316,15 +339,25 @@ def _names(files: SogFiles, name: str) -> list[str]:
 
 def _numbers(files: SogFiles, name: str, key: str, count: int) -> np.ndarray:
     """[count] float32 of meta.json, finite."""
-    found = _entry(files, name).get(key)
-    numbers = isinstance(found, list) and len(found) == count and all(type(x) in (int, float) for x in found)
-    with np.errstate(over="ignore"):
-        values = (
-            np.array(found, np.float64).astype(np.float32) if numbers else np.full(count, np.nan, np.float32)
-        )
+    values = _values(files, name, key, count)
     if not np.isfinite(values).all():
         raise SplatFileError(f"{files.place}: {name}.{key}: expected {count} finite numbers")
     return values
+
+
+def _codebook(files: SogFiles, name: str) -> np.ndarray:
+    """[BOOK] float32; null, by which JSON writes what is not finite, is not-a-number."""
+    return _values(files, name, "codebook", BOOK)
+
+
+def _values(files: SogFiles, name: str, key: str, count: int) -> np.ndarray:
+    """[count] float32 of meta.json."""
+    found = _entry(files, name).get(key)
+    numbers = isinstance(found, list) and all(x is None or type(x) in (int, float) for x in found)
+    if not isinstance(found, list) or not numbers or len(found) != count:
+        raise SplatFileError(f"{files.place}: {name}.{key}: expected {count} numbers")
+    with np.errstate(over="ignore"):
+        return np.array([np.nan if x is None else x for x in found], np.float64).astype(np.float32)
 
 
 def _pixels(files: SogFiles, name: str, index: int, channels: int) -> np.ndarray:
@@ -360,19 +393,15 @@ def _positions(files: SogFiles, steps: np.ndarray) -> np.ndarray:
         return (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
 
 
-def _rotations(files: SogFiles, pixels: np.ndarray) -> np.ndarray:
-    """[M, 4] bytes -> [M, 4] w-x-y-z."""
-    wrong = np.flatnonzero(pixels[:, 3] < QUATERNION_TAG)
-    if len(wrong):
-        raise SplatFileError(
-            f"{files.place}: quats: splat {wrong[0]} has tag {pixels[wrong[0], 3]}; expected 252 to 255"
-        )
+def _rotations(pixels: np.ndarray) -> np.ndarray:
+    """[M, 4] bytes -> [M, 4] w-x-y-z; zero, which is no rotation, where the tag names no part."""
     others = (pixels[:, :3] / 255 - 0.5) * _SQRT2
-    largest = (pixels[:, 3] - QUATERNION_TAG).astype(np.int64)
+    largest = (pixels[:, 3] & 3).astype(np.int64)  # tags are 252 to 255
     wxyz = np.empty((len(pixels), 4))
     wxyz[np.arange(4) != largest[:, None]] = others.reshape(-1)
     missing = np.sqrt(np.maximum(1 - (others**2).sum(1), 0))
     np.put_along_axis(wxyz, largest[:, None], missing[:, None], 1)
+    wxyz[pixels[:, 3] < QUATERNION_TAG] = 0
     return wxyz.astype(np.float32)
 
 
@@ -394,7 +423,7 @@ def _palette_entries(files: SogFiles) -> np.ndarray:
             f"{-(-count // PALETTE_ROW)} for {count} entries of {bands} bands"
         )
     labels = _pixels(files, "shN", 1, 2).astype(np.int64) @ np.array([1, 256])
-    if labels.max() >= count:
-        raise SplatFileError(f"{files.place}: shN: label {labels.max()} of {count} entries; copy it again")
-    book = _numbers(files, "shN", "codebook", BOOK)
-    return book[pixels.reshape(-1, coefficients, 3)[labels]]
+    book = _codebook(files, "shN")
+    rest = book[pixels.reshape(-1, coefficients, 3)[np.minimum(labels, count - 1)]]
+    rest[labels >= count] = np.nan  # a label that names no entry says nothing of the splat's color
+    return rest

@@ -15,28 +15,44 @@ from pathlib import Path
 import numpy as np
 
 from compgs.errors import SplatFileError
-from compgs.formats.arrays import COLOR_OFFSET, Y0, SplatArrays, checked, logit
+from compgs.formats.arrays import COLOR_OFFSET, Y0, SplatArrays, drawable, log_scales, logit
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 # A quaternion of bytes is of length one to within this; of random bytes few are.
 _LENGTH_ERROR = 0.1
 _LARGEST = 1e6  # world units, of what is believed to be a splat
+# A file is believed to be one where this part of its first splats are possible: a few that are odd spoil no file.
+_POSSIBLE = 0.75
 
 
 def begins(head: bytes) -> bool:
-    """Whether the first bytes are whole splats that could be."""
+    """Whether the first bytes are whole splats, most of which could be."""
+    possible = _possible(head)
+    return len(possible) > 0 and float(possible.mean()) >= _POSSIBLE
+
+
+def doubt(head: bytes) -> str:
+    """What speaks against a .splat file that `begins` does not believe in."""
+    possible = _possible(head)
+    if not len(possible):
+        return f"a .splat holds {ROW.itemsize} bytes a splat, this file has {len(head)}"
+    return (
+        f"as a .splat, {(~possible).sum()} of its first {len(possible)} splats, the first of them number "
+        f"{int(np.argmin(possible))}, have a size or a rotation that no splat has"
+    )
+
+
+def _possible(head: bytes) -> np.ndarray:
+    """[M] bool: of the splats that these bytes would be, those whose size and rotation a splat may have."""
     rows = np.frombuffer(head[: len(head) // ROW.itemsize * ROW.itemsize], ROW)
-    if not len(rows):
-        return False
     lengths = np.linalg.norm((rows["rotation"].astype(np.float64) - 128) / 128, axis=1)
     with np.errstate(invalid="ignore"):
-        possible = (
+        return (
             (np.abs(rows["mean"]).max(1) < _LARGEST)
             & (rows["scale"].min(1) >= 0)
             & (rows["scale"].max(1) < _LARGEST)
             & (np.abs(lengths - 1) < _LENGTH_ERROR)
         )
-    return bool(possible.all())
 
 
 def check(path: Path) -> None:
@@ -52,20 +68,13 @@ def read(path: Path) -> SplatArrays:
     """Raises SplatFileError."""
     check(path)
     rows = np.fromfile(path, ROW)
-    scales = rows["scale"]
-    if not (scales >= 0).all():
-        row = int(np.flatnonzero(~(scales >= 0).all(1))[0])
-        raise SplatFileError(f"{path}: scales of splat {row} are {scales[row]}, expected positive numbers")
     colors = rows["color"] / 255
-    quaternions = (rows["rotation"].astype(np.float32) - 128) / 128
-    # Flat splats have an extent of zero: of the smallest that has a logarithm in float32.
-    log_scales = np.log(np.maximum(scales, np.finfo(np.float32).tiny))
-    return checked(
+    return drawable(
         path,
         SplatArrays(
             means=rows["mean"].copy(),
-            log_scales=log_scales,
-            quaternions=quaternions,
+            log_scales=log_scales(rows["scale"]),
+            quaternions=(rows["rotation"].astype(np.float32) - 128) / 128,
             opacity_logits=logit(colors[:, 3]),
             dc=((colors[:, :3] - COLOR_OFFSET) / Y0).astype(np.float32),
             rest=np.zeros((len(rows), 0, 3), np.float32),

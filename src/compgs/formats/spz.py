@@ -10,7 +10,7 @@
 | count | 4 | splats |
 | degree | 1 | of the harmonics, 0 to 4, of which degree 4 is left out here |
 | fractional bits | 1 | of positions |
-| flags | 1 | 1: trained with antialiasing; 2: extensions are there, which are skipped |
+| flags | 1 | 1: antialiased (`SplatArrays.antialiased`); 2: extensions are there |
 | streams | 1 | columns in the table; 0 before version 4 |
 | table offset | 4 | version 4 only, then 12 bytes of zero; an entry is two uint64: packed, unpacked bytes |
 
@@ -25,14 +25,18 @@
 | | 3 | versions 1 and 2: x, y, z = byte / 127.5 - 1, w >= 0 |
 | harmonics | 9, 24, 45, 72 | (byte - 128) / 128; coefficient by coefficient, red green blue |
 
-Little endian. Axes are right, up, back. There is no place for where positions count from: they are written as they
-are, in the model's own frame.
+An extension is a uint32 that says which, a uint32 that says how many bytes follow, and these. 0xADBE0003 holds a
+uint32, 1 to 16: the axes of the file (`AXES`). Others, as 0xADBE0002 (how far a viewer may go), change no picture from
+a given place; they are named in a note. Before version 4 extensions follow the columns.
+
+Little endian. Axes are right, up, back where no extension says otherwise. There is no place for where positions count
+from: they are written as they are, in the model's own frame.
 """
 
 import gzip
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,21 +49,29 @@ from compgs.formats.arrays import (
     MOST_DEGREE_HELD,
     SplatArrays,
     check_count,
-    checked,
+    drawable,
     harmonics_above_dc,
     logit,
     normalized,
 )
-from compgs.formats.frames import RIGHT_UP_BACK, turned
+from compgs.formats.frames import RIGHT_UP_BACK, from_axes, turned
+from compgs.notes import note
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"
 VERSIONS = (1, 2, 3, 4)
 WRITTEN_VERSIONS = (3, 4)
-HAS_EXTENSIONS = 2
+ANTIALIASED, HAS_EXTENSIONS = 1, 2  # flags
+COORDINATE_SYSTEM = 0xADBE0003  # an extension
+# By its value: where x, y and z point to.
+AXES = (
+    "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
+)  # fmt: skip
+USUAL_AXES = "RUB"
 _HEADER = struct.Struct("<4sIIBBBB")
 _LONG_HEADER = struct.Struct("<4sIIBBBBI12x")
 _TABLE_ENTRY = struct.Struct("<QQ")
+_EXTENSION = struct.Struct("<II")
 _MOST_EXTENSION_BYTES = 1 << 20
 
 COLOR_SCALE = 0.15
@@ -110,6 +122,7 @@ def encoded(arrays: SplatArrays, version: int = 3) -> bytes:
     arrays = turned(arrays, RIGHT_UP_BACK)
     bits = fractional_bits(arrays)
     degree = arrays.degree
+    flags = ANTIALIASED if arrays.antialiased else 0
     columns = [
         _packed_positions(arrays.means, bits),
         np.rint(255 * arrays.opacities),
@@ -120,11 +133,12 @@ def encoded(arrays: SplatArrays, version: int = 3) -> bytes:
     ][: len(columns_of(version, degree))]
     data = [column.astype(np.uint8).tobytes() for column in columns]
     if version < 4:
-        header = _HEADER.pack(MAGIC, version, len(arrays), degree, bits, 0, 0)
+        header = _HEADER.pack(MAGIC, version, len(arrays), degree, bits, flags, 0)
         return gzip.compress(header + b"".join(data), compresslevel=9, mtime=0)
     compress = _zstandard()[0]
     packed = [compress(column) for column in data]
-    header = _LONG_HEADER.pack(MAGIC, version, len(arrays), degree, bits, 0, len(data), _LONG_HEADER.size)
+    size = _LONG_HEADER.size
+    header = _LONG_HEADER.pack(MAGIC, version, len(arrays), degree, bits, flags, len(data), size)
     table = b"".join(_TABLE_ENTRY.pack(len(p), len(d)) for p, d in zip(packed, data, strict=True))
     return header + table + b"".join(packed)
 
@@ -193,7 +207,9 @@ def read(path: Path) -> SplatArrays:
     """Raises SplatFileError, MissingDependency (version 4, without a Zstandard module)."""
     data = path.read_bytes()
     header = _header(path, data)
-    columns = _long_columns(path, header, data) if header.version == 4 else _gzip_columns(path, header, data)
+    unpacked = _long_columns if header.version == 4 else _gzip_columns
+    columns, records = unpacked(path, header, data)
+    axes = _axes(path, header, records)
     arrays = {
         name: np.frombuffer(column, np.uint8).reshape(header.count, -1)
         for name, column in zip(header.columns, columns, strict=True)
@@ -211,8 +227,43 @@ def read(path: Path) -> SplatArrays:
         opacity_logits=logit(arrays["opacities"][:, 0] / 255),
         dc=((arrays["colors"] / 255 - 0.5) / COLOR_SCALE).astype(np.float32),
         rest=(rest.astype(np.float32) - 128) / 128,
+        antialiased=bool(header.flags & ANTIALIASED),
     )
-    return turned(checked(path, found), RIGHT_UP_BACK)
+    return from_axes(drawable(path, found), axes)
+
+
+def _axes(path: Path, header: SpzHeader, records: bytes) -> str:
+    """Of the file, by its extensions; what else they and the flags say is told."""
+    axes, passed_over = USUAL_AXES, []
+    if header.degree > MAX_DEGREE:
+        passed_over.append(f"harmonics of degree {header.degree}")
+    if unknown := header.flags & ~(ANTIALIASED | HAS_EXTENSIONS):
+        passed_over.append(f"flags {unknown:#x}")
+    for kind, content in _extensions(path, records):
+        if kind != COORDINATE_SYSTEM:
+            passed_over.append(f"extension {kind:#010x} of {len(content)} bytes")
+            continue
+        number = int.from_bytes(content, "little")
+        if not 1 <= number <= len(AXES):
+            raise SplatFileError(f"{path}: axes number {number}; expected 1 to {len(AXES)}")
+        axes = AXES[number - 1]
+    if passed_over:
+        note(path, f"not used: {', '.join(passed_over)}")
+    return axes
+
+
+def _extensions(path: Path, records: bytes) -> Iterator[tuple[int, bytes]]:
+    """Which extension, and what it holds. Raises SplatFileError for records that are not whole."""
+    place = 0
+    while place < len(records):
+        rest = records[place:]
+        kind, size = _EXTENSION.unpack_from(rest) if len(rest) >= _EXTENSION.size else (0, len(rest))
+        place += _EXTENSION.size + size
+        if place > len(records):
+            raise SplatFileError(
+                f"{path}: an extension promises {size} bytes, {len(rest) - _EXTENSION.size} are there; copy it again"
+            )
+        yield kind, rest[_EXTENSION.size : _EXTENSION.size + size]
 
 
 def component_bytes(path: Path) -> dict[str, int]:
@@ -254,11 +305,12 @@ def _header(path: Path, data: bytes) -> SpzHeader:
     return header
 
 
-def _gzip_columns(path: Path, header: SpzHeader, data: bytes) -> list[bytes]:
+def _gzip_columns(path: Path, header: SpzHeader, data: bytes) -> tuple[list[bytes], bytes]:
+    """And the extensions behind them."""
     sizes = [header.count * size for size in header.columns.values()]
     promised = _HEADER.size + sum(sizes)
     most = promised + (_MOST_EXTENSION_BYTES if header.flags & HAS_EXTENSIONS else 0)
-    content, whole = data, True
+    content, end, after = data, True, b""
     if data.startswith(GZIP_MAGIC):
         unpacker = zlib.decompressobj(wbits=31)
         try:
@@ -266,14 +318,18 @@ def _gzip_columns(path: Path, header: SpzHeader, data: bytes) -> list[bytes]:
             content = unpacker.decompress(data, most + 1)
         except zlib.error as error:
             raise SplatFileError(f"{path}: is damaged ({error}); copy it again") from error
-        whole = unpacker.eof and not unpacker.unused_data
-    if not promised <= len(content) <= most or not whole:
+        end, after = unpacker.eof, unpacker.unused_data
+    if len(content) < promised or len(content) > most:
         found = f"more than {most}" if len(content) > most else str(len(content))
         raise SplatFileError(
             f"{path}: {header.count} splats are {promised} bytes unpacked, the file holds {found}; copy it again"
         )
+    if not end:
+        raise SplatFileError(f"{path}: its compressed data have no end; copy it again")
+    if after:  # the data before them are whole: gzip ends with a checksum
+        note(path, f"not used: {len(after)} bytes after the end of the compressed data")
     ends = _HEADER.size + np.cumsum(sizes)
-    return [content[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+    return [content[end - size : end] for end, size in zip(ends, sizes, strict=True)], content[promised:]
 
 
 def _table(path: Path, header: SpzHeader, data: bytes) -> list[tuple[int, int]]:
@@ -293,12 +349,16 @@ def _table(path: Path, header: SpzHeader, data: bytes) -> list[tuple[int, int]]:
             raise SplatFileError(
                 f"{path}: {name}: {unpacked} bytes, expected {header.count * size} for {header.count} splats"
             )
-    if first + sum(packed for packed, _ in table) != len(data):
-        raise SplatFileError(f"{path}: its columns do not end where the file does; copy it again")
+    end = first + sum(packed for packed, _ in table)
+    if end != len(data):
+        raise SplatFileError(
+            f"{path}: its columns do not end where the file does, but at byte {end} of {len(data)}; copy it again"
+        )
     return table
 
 
-def _long_columns(path: Path, header: SpzHeader, data: bytes) -> list[bytes]:
+def _long_columns(path: Path, header: SpzHeader, data: bytes) -> tuple[list[bytes], bytes]:
+    """And the extensions before them."""
     unpack = _zstandard()[1]
     table = _table(path, header, data)
     ends = len(data) - np.cumsum([packed for packed, _ in table[::-1]])[::-1]
@@ -311,7 +371,8 @@ def _long_columns(path: Path, header: SpzHeader, data: bytes) -> list[bytes]:
         if len(column) != unpacked:
             raise SplatFileError(f"{path}: {name}: {len(column)} bytes, expected {unpacked}; copy it again")
         columns.append(column)
-    return columns
+    records = data[_LONG_HEADER.size : header.table_offset] if header.flags & HAS_EXTENSIONS else b""
+    return columns, records
 
 
 def _positions(columns: np.ndarray, bits: int) -> np.ndarray:

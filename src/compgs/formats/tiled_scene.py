@@ -143,6 +143,11 @@ class TiledScene:
         return self.manifest.angular_dilation
 
     @property
+    def antialiased(self) -> bool:
+        """Trained with plain dilation."""
+        return False
+
+    @property
     def up(self) -> Vector:
         """Direction of the sky."""
         return self.manifest.up

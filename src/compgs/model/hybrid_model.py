@@ -41,6 +41,11 @@ class HybridModel:
     angular_dilation: float | None = None  # of what is drawn (`RasterSettings`)
 
     @property
+    def antialiased(self) -> bool:
+        """Trained with plain dilation: opacities are those at which it was trained."""
+        return False
+
+    @property
     def anchors(self) -> int:
         return len(self.primitives)
 

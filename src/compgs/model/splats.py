@@ -33,6 +33,8 @@ class SplatArrays:
     dc: np.ndarray  # [M, 3] coefficients of degree 0, RGB
     rest: np.ndarray  # [M, K, 3] of degree 1 to `degree`: K = 0, 3, 8 or 15
     world_offset: tuple[float, float, float] = ORIGIN  # world units, float64
+    # Whether they were trained with opacities that fall as dilation spreads a splat (`RasterSettings.antialiased`).
+    antialiased: bool = False
 
     def __len__(self) -> int:
         return len(self.means)
@@ -43,15 +45,19 @@ class SplatArrays:
         return degree_of(self.rest.shape[1])
 
     @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """By name what each splat has a row of."""
+        names = "means", "log_scales", "quaternions", "opacity_logits", "dc", "rest"
+        return {name: getattr(self, name) for name in names}
+
+    @property
     def opacities(self) -> np.ndarray:
         """[M] in [0, 1], float64."""
         return sigmoid(self.opacity_logits.astype(np.float64))
 
     def each(self, change: Callable[[np.ndarray], np.ndarray]) -> "SplatArrays":
         """The same with every array changed, as by choosing rows."""
-        arrays: dict[str, Any] = {
-            name: change(value) for name, value in vars(self).items() if name != "world_offset"
-        }
+        arrays: dict[str, Any] = {name: change(value) for name, value in self.columns.items()}
         return replace(self, **arrays)
 
     def rows(self, index: np.ndarray) -> "SplatArrays":
@@ -95,6 +101,11 @@ class SplatModel:
     def angular_dilation(self) -> None:
         """3DGS's pixels, in pictures of every size."""
         return None
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether opacities fall as dilation spreads the splats."""
+        return self.splats.antialiased
 
     @property
     def counts(self) -> Mapping[str, int]:

@@ -60,6 +60,18 @@ def camera_numbers(camera: Camera, settings: RasterSettings) -> np.ndarray:
     )
 
 
+def kept_opacity(covariances: np.ndarray, determinants: np.ndarray, dilation: float) -> np.ndarray:
+    """[M] float32, 0 to 1: the share of a splat's opacity that stays where dilation spreads it (`antialiased`), from
+    covariances [M, 3] and determinants [M] after it.
+
+    The determinant before it is what is left of that after it. Rounding makes a share wrong by 1.5e-7 of its inverse:
+    1 % where an opaque splat vanishes, less elsewhere.
+    """
+    a, c = covariances[:, 0].astype(np.float64), covariances[:, 2].astype(np.float64)
+    before = determinants - dilation * (a + c) + dilation**2
+    return np.sqrt(np.clip(before / determinants, 0, 1)).astype(np.float32)
+
+
 @njit(inline="always")
 def load_block(s, first, count, means, quaternions, scales):
     """Copies `count` Gaussians to the scratch buffer, one row of floats per quantity."""

@@ -7,14 +7,14 @@ opacities, colors ────────────────────�
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.render.binning import PARAMETERS, TileLists, list_tiles, pack_splats
-from compgs.render.projection import camera_numbers, project_forward
+from compgs.render.projection import camera_numbers, kept_opacity, project_forward
 from compgs.render.result import RasterResult
 from compgs.render.settings import DEFAULT_SETTINGS, RasterSettings
 from compgs.render.tiles import MOMENTS, blend_backward, blend_forward, sum_moments
@@ -61,7 +61,7 @@ def tile_lists(
             depths[rows],
             determinants[rows],
         )
-        packed[rows, 5] = g.opacities
+        packed[rows, 5] = g.opacities * _kept(packed[rows, 2:5], determinants[rows], camera, settings)
         packed[rows, 6:9] = g.colors
         m += len(g)
         del gaussians, g
@@ -80,6 +80,15 @@ def tile_lists(
     )
     del determinants
     return list_tiles(splats, depths)
+
+
+def _kept(
+    covariances: np.ndarray, determinants: np.ndarray, camera: Camera, settings: RasterSettings
+) -> np.ndarray | float:
+    """Share of the opacities that is drawn, [M] or one number."""
+    if not settings.antialiased:
+        return 1.0
+    return kept_opacity(covariances, determinants, settings.dilation_of(camera))
 
 
 def contiguous(gaussians: Gaussians[np.ndarray]) -> Gaussians[np.ndarray]:
@@ -180,7 +189,8 @@ class BlendedOnCpu:
     _transmittance: np.ndarray
     _lists: TileLists
     _ends: np.ndarray
-    _opacities: np.ndarray
+    _opacities: np.ndarray  # as they are drawn
+    _kept: np.ndarray | float  # their share of the Gaussians' own
     _settings: RasterSettings
 
     def gradients(self, d_image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -195,14 +205,30 @@ class BlendedOnCpu:
             np.require(d_image, np.float32, ("C", "W")),
             np.zeros_like(self._transmittance),
         )
-        return found.opacities, found.colors
+        return found.opacities * self._kept, found.colors
 
 
 def blended(
     gaussians: Gaussians[np.ndarray], camera: Camera, settings: RasterSettings = DEFAULT_SETTINGS
 ) -> BlendedOnCpu:
     """The image of Gaussians, with its gradients by their opacities and colors."""
-    lists = tile_lists([gaussians], len(gaussians), camera, settings)
+    kept = opacity_shares(gaussians, camera, settings)
+    opacities = np.require(gaussians.opacities * kept, np.float32, ("C", "W"))
+    plain = replace(settings, antialiased=False)
+    lists = tile_lists([replace(gaussians, opacities=opacities)], len(gaussians), camera, plain)
     image, transmittance, ends = blend(lists, camera, settings)
-    opacities = np.require(gaussians.opacities, np.float32, ("C", "W"))
-    return BlendedOnCpu(image, transmittance, lists, ends, opacities, settings)
+    return BlendedOnCpu(image, transmittance, lists, ends, opacities, kept, settings)
+
+
+def opacity_shares(
+    gaussians: Gaussians[np.ndarray], camera: Camera, settings: RasterSettings
+) -> np.ndarray | float:
+    """Share of the opacities that is drawn, [M] or one number."""
+    if not settings.antialiased:
+        return 1.0
+    g, m = contiguous(gaussians), len(gaussians)
+    means2d, covariances = np.empty((m, 2), np.float32), np.empty((m, 3), np.float32)
+    depths, determinants = np.empty(m, np.float32), np.empty(m, np.float32)
+    numbers = camera_numbers(camera, settings)
+    project_forward(g.means, g.quaternions, g.scales, numbers, means2d, covariances, depths, determinants)
+    return kept_opacity(covariances, determinants, settings.dilation_of(camera))

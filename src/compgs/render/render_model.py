@@ -34,6 +34,11 @@ class Renderable(Protocol):
         ...
 
     @property
+    def antialiased(self) -> bool:
+        """As `RasterSettings.antialiased`."""
+        ...
+
+    @property
     def world_offset(self) -> tuple[float, float, float]:
         """World units, float64: origin of the local frame."""
         ...
@@ -74,7 +79,9 @@ class Renderable(Protocol):
 def settings_of(model: Renderable, background: tuple[float, float, float] | None = None) -> RasterSettings:
     """How a scene is drawn, over its own background or another."""
     behind = model.background if background is None else background
-    return RasterSettings(background=behind, angular_dilation=model.angular_dilation)
+    return RasterSettings(
+        background=behind, angular_dilation=model.angular_dilation, antialiased=model.antialiased
+    )
 
 
 def local_camera(model: Renderable, camera: Camera) -> Camera:

@@ -26,6 +26,10 @@ class RasterSettings:
     # The same as a scene was trained with, whatever the size of the picture: per fx fy of a camera (squares of the
     # tangents of angles), in place of `dilation`.
     angular_dilation: float | None = None
+    # Whether an opacity falls as dilation spreads its splat, so that a small splat stays as bright as it is (the 2D Mip
+    # filter, Yu et al. 2024): by the square root of the determinants of its covariance before and after. For splats
+    # that were trained so; others would become too dark.
+    antialiased: bool = False
 
     def dilation_of(self, camera: Camera) -> float:
         """Pixels^2 that are added in the picture of a camera."""

@@ -37,7 +37,7 @@ def rasterize_gsplat(gaussians: Gaussians, camera: Camera, settings: RasterSetti
         return nothing_drawn(gaussians, camera, background)
 
     view, intrinsics = camera_on(camera, means.device)
-    radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
+    radii, means2d, depths, conics, kept = gsplat.fully_fused_projection(
         means.contiguous(),
         None,
         gaussians.quaternions.contiguous(),
@@ -50,10 +50,13 @@ def rasterize_gsplat(gaussians: Gaussians, camera: Camera, settings: RasterSetti
         near_plane=settings.near_plane,
         packed=False,
         opacities=opacities.contiguous(),
+        calc_compensations=settings.antialiased,
     )
     visible = (radii[0] > 0).all(-1)
     # Rows of Gaussians that are not drawn are not initialized by gsplat.
     means2d = torch.where(visible[:, None], means2d[0], means2d.new_zeros(()))
+    if settings.antialiased:
+        opacities = opacities * torch.where(visible, kept[0], kept.new_zeros(()))
     columns, rows = -(-camera.width // TILE_SIZE), -(-camera.height // TILE_SIZE)
     with torch.no_grad():
         _, tiles, splats = gsplat.isect_tiles(
@@ -78,7 +81,7 @@ def rasterize_gsplat(gaussians: Gaussians, camera: Camera, settings: RasterSetti
 
 def check_settings(settings: RasterSettings) -> None:
     """Raises ConfigError for a setting that gsplat's kernels hold as a compiled constant."""
-    free = {"background", "near_plane", "dilation", "angular_dilation"}
+    free = {"background", "near_plane", "dilation", "angular_dilation", "antialiased"}
     fixed = replace(DEFAULT_SETTINGS, **{name: getattr(settings, name) for name in free})
     if settings != fixed:
         raise ConfigError(

@@ -24,7 +24,7 @@ def rasterize_numba(
     gaussians: Gaussians[Tensor], camera: Camera, settings: RasterSettings
 ) -> RasterResult[Tensor]:
     """float32 tensors on the CPU."""
-    if not (torch.is_grad_enabled() and any(t.requires_grad for t in tensors_of(gaussians))):
+    if not wants_gradients(gaussians):
         return draw(gaussians, camera, settings)
     means2d, covariances, depths, determinants = Project.apply(
         gaussians.means, gaussians.quaternions, gaussians.scales, camera_numbers(camera, settings)
@@ -33,6 +33,11 @@ def rasterize_numba(
         means2d, covariances, gaussians.opacities, gaussians.colors, depths, determinants, camera, settings
     )
     return RasterResult(image, transmittance, means2d, visible)
+
+
+def wants_gradients(gaussians: Gaussians[Tensor]) -> bool:
+    """Whether what is drawn of them shall be differentiated."""
+    return torch.is_grad_enabled() and any(t.requires_grad for t in tensors_of(gaussians))
 
 
 def tensors_of(gaussians: Gaussians[Tensor]) -> tuple[Tensor, ...]:

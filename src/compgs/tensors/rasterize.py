@@ -15,6 +15,8 @@ def rasterize(
 ) -> RasterResult[Tensor]:
     """Differentiable rendering: gsplat on CUDA, numba for float32 on the CPU, the reference otherwise.
 
+    The kernels for the CPU have no gradients of antialiased splats, which nothing here trains: the reference has.
+
     Gradients go to means, quaternions, scales, opacities and colors; cameras and settings are constants.
     """
     means = gaussians.means
@@ -24,7 +26,8 @@ def rasterize(
 
         return rasterize_gsplat(gaussians, camera, settings)
     if means.device.type == "cpu" and means.dtype == torch.float32:
-        from compgs.tensors.numba_backend import rasterize_numba
+        from compgs.tensors.numba_backend import rasterize_numba, wants_gradients
 
-        return rasterize_numba(gaussians, camera, settings)
+        if not (settings.antialiased and wants_gradients(gaussians)):
+            return rasterize_numba(gaussians, camera, settings)
     return rasterize_reference(gaussians, camera, settings)

@@ -7,7 +7,7 @@ al. 2023; the projection is Zwicker et al. 2001). Every faster backend is tested
 gradients. Memory grows with Gaussians x pixels of a strip of rows, and autograd keeps all strips.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from compgs.render.result import RasterResult
 from compgs.render.settings import DEFAULT_SETTINGS, RasterSettings, jacobian_limits
 
 ROWS_PER_STRIP = 8
+LEAST_SHARE = 1e-12  # of an opacity
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +27,7 @@ class Splats:
 
     means2d: Tensor  # [M, 2] pixels
     covariances: Tensor  # [M, 2, 2] pixels^2, dilated
+    kept: Tensor  # [M] of opacities, where the settings are antialiased: 0 to 1
     depths: Tensor  # [M] world units along the camera's z axis
     drawn: Tensor  # [M] bool: beyond the near plane, and finite
 
@@ -35,6 +37,8 @@ def rasterize_reference(
 ) -> RasterResult:
     """Image and gradients by plain autograd."""
     splats = project(gaussians, camera, settings)
+    if settings.antialiased:
+        gaussians = replace(gaussians, opacities=gaussians.opacities * splats.kept)
     visible = splats.drawn & meets_image(splats, gaussians, camera, settings)
     image, transmittance = composite(splats, gaussians, visible, camera, settings)
     return RasterResult(image, transmittance, splats.means2d, visible)
@@ -88,8 +92,12 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> S
     factor = jacobian @ rotation @ rotation_matrices(quaternions) * scales[:, None, :]
     dilation = settings.dilation_of(camera) * torch.eye(2, dtype=like.dtype, device=like.device)
     covariances = factor @ factor.mT + dilation
+    # Squared: the determinant of F F^T for F of two rows, summed from squares, so that nothing cancels.
+    before = torch.linalg.cross(factor[:, 0], factor[:, 1]).square().sum(-1)
+    # The gradient of a root at zero is not finite.
+    kept = torch.sqrt((before / torch.linalg.det(covariances)).clamp(min=LEAST_SHARE**2))
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
-    return Splats(torch.where(drawn[:, None], means2d, zero[:, None]), covariances, z.detach(), drawn)
+    return Splats(torch.where(drawn[:, None], means2d, zero[:, None]), covariances, kept, z.detach(), drawn)
 
 
 @torch.no_grad()

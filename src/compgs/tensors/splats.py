@@ -39,8 +39,8 @@ class Splats:
     @classmethod
     def of(cls, arrays: SplatArrays) -> "Splats":
         """On the CPU; the arrays are copied."""
-        named = {name: value for name, value in vars(arrays).items() if name != "world_offset"}
-        return cls(**{name: torch.from_numpy(np.array(value, np.float32)) for name, value in named.items()})
+        named = arrays.columns.items()
+        return cls(**{name: torch.from_numpy(np.array(value, np.float32)) for name, value in named})
 
     def arrays(self, world_offset: tuple[float, float, float] = ORIGIN) -> SplatArrays:
         """Inverse of `of`; on the CPU they share the memory of the tensors."""

@@ -66,6 +66,11 @@ class AnchorScene:
         return None
 
     @property
+    def antialiased(self) -> bool:
+        """Trained with plain dilation."""
+        return False
+
+    @property
     def world_offset(self) -> tuple[float, float, float]:
         return self.frame.world_offset
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import SplatFileError
-from compgs.formats.arrays import checked
+from compgs.formats.arrays import drawable
 from compgs.formats.packed import Packed
 from compgs.gaussians import Gaussians
 from compgs.methods.compact_3dgs import MOST_CELLS, MOST_FEATURES, MOST_LEVELS, MOST_TABLE_BITS
@@ -51,6 +51,11 @@ class NetworkColored:
     def angular_dilation(self) -> None:
         """3DGS's pixels, in pictures of every size."""
         return None
+
+    @property
+    def antialiased(self) -> bool:
+        """Trained with plain dilation."""
+        return False
 
     @property
     def world_offset(self) -> Offset:
@@ -147,7 +152,7 @@ def opened(packed: Packed, device: "Device", background: tuple[float, float, flo
             np.zeros((count, 0, 3), np.float32),
             stored_place(packed),
         )
-    return NetworkColored(SplatModel(checked(packed.path, arrays), background), network)
+    return NetworkColored(SplatModel(drawable(packed.path, arrays), background), network)
 
 
 def _network(packed: Packed) -> ColorNetwork:
