@@ -38,9 +38,11 @@ def backward(result, generator_seed: int = 0):
     ((result.image * weights[..., :3]).sum() + (result.transmittance * weights[..., 3]).sum()).backward()
 
 
-def test_image_and_gradients_agree_with_float64_autograd():
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_image_and_gradients_agree_with_float64_autograd(antialiased):
+    settings = dataclasses.replace(SETTINGS, antialiased=antialiased)
     true_in, fast_in = make_gaussians(torch.float64, "cpu"), make_gaussians(torch.float32, "cuda")
-    true, fast = rasterize_reference(true_in, CAMERA, SETTINGS), rasterize(fast_in, CAMERA, SETTINGS)
+    true, fast = rasterize_reference(true_in, CAMERA, settings), rasterize(fast_in, CAMERA, settings)
     backward(true)
     backward(fast)
     # gsplat ends a splat at 3.33 standard deviations, slightly before an opaque one reaches the alpha cutoff.
