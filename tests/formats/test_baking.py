@@ -109,6 +109,7 @@ class TwoBalls:
     coupled = 2
     background = world_offset = (0.0, 0.0, 0.0)
     angular_dilation = None
+    antialiased = False
     primitives = SimpleNamespace(anchor_index=np.arange(2), positions=np.zeros((2, 3), np.float32))
     geometry = (
         np.array([[0.0, 0, 0], [0, 0, -1]], np.float32),

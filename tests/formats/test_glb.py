@@ -253,7 +253,9 @@ def test_a_mesh_that_two_nodes_place_is_there_twice(made, tmp_path: Path) -> Non
     path.write_bytes(data)
     found = glb.read(path)
     np.testing.assert_array_equal(found.means[:5], arrays.means)
-    np.testing.assert_allclose(found.means[5:], arrays.means - np.float32([10, 0, 0]), rtol=1e-6)  # left is -x
+    np.testing.assert_allclose(
+        found.means[5:], arrays.means - np.float32([10, 0, 0]), rtol=1e-6
+    )  # left is -x
     np.testing.assert_array_equal(found.rest[5:], arrays.rest)
     sizes = glb.component_bytes(path)
     assert sum(sizes.values()) == len(data) and sizes["positions"] == 60  # there once

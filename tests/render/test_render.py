@@ -34,6 +34,7 @@ class PlainModel:
 
     background = (0.1, 0.6, 0.3)
     angular_dilation: float | None = None
+    antialiased: bool = False
     world_offset = (0.0, 0.0, 0.0)
     bounds = (np.array([[0.0, 0, 3], [0, 0, -3]], np.float32), np.array([0.7, 0.7], np.float32))
     counts: ClassVar = {"splats": 50}
@@ -150,7 +151,7 @@ def test_settings_that_gsplat_cannot_obey_are_refused():
         {"margin": 0.15},
     ):
         with pytest.raises(
-            ConfigError, match="on CUDA only angular_dilation, background, dilation, near_plane"
+            ConfigError, match="on CUDA only angular_dilation, antialiased, background, dilation, near_plane"
         ):
             check_settings(dataclasses.replace(RasterSettings(), **change))
 
