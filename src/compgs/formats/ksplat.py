@@ -47,8 +47,9 @@ from compgs.formats.arrays import (
     MAX_DEGREE,
     Y0,
     SplatArrays,
-    checked,
+    drawable,
     harmonics_above_dc,
+    log_scales,
     logit,
 )
 
@@ -154,11 +155,9 @@ def read(path: Path) -> SplatArrays:
         return np.concatenate([part[name] for part in rows]).astype(np.float32)
 
     colors = joined("color") / 255
-    with np.errstate(divide="ignore", invalid="ignore"):  # what has no logarithm is refused
-        log_scales = np.log(joined("scale"))
     found = SplatArrays(
         means=np.concatenate([_means(path, data, *pair) for pair in zip(layout.sections, rows, strict=True)]),
-        log_scales=log_scales,
+        log_scales=log_scales(joined("scale")),
         quaternions=joined("rotation"),
         opacity_logits=logit(colors[:, 3]),
         dc=((colors[:, :3] - COLOR_OFFSET) / Y0).astype(np.float32),
@@ -169,7 +168,7 @@ def read(path: Path) -> SplatArrays:
             ]
         ),
     )
-    return checked(path, found)
+    return drawable(path, found)
 
 
 def component_bytes(path: Path) -> dict[str, int]:

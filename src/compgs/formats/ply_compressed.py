@@ -15,7 +15,7 @@ A chunk holds the ranges of 256 splats, in float32; the splats of it lie between
 | | packed_color | 8 bits each: red, green, blue between the chunk's; opacity / 255 |
 | sh | f_rest_0 ... | a byte each, channel by channel: 0 is -4, 255 is 4, between them (v + 1/2) / 32 - 4 |
 
-Axes are those of other .ply files.
+Axes, and the comment that says how splats are drawn, are those of other .ply files.
 """
 
 from dataclasses import dataclass
@@ -30,10 +30,11 @@ from compgs.formats.arrays import (
     MAX_DEGREE,
     Y0,
     SplatArrays,
-    checked,
+    drawable,
     harmonics_above_dc,
     logit,
 )
+from compgs.notes import note
 
 CHUNK = 256  # splats that share their ranges
 _POSITIONS = tuple(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz")
@@ -54,6 +55,8 @@ class Layout:
     rows: dict[str, np.dtype]  # of chunk, vertex and, where there are harmonics, sh
     starts: dict[str, int]  # bytes before the first row of each
     bytes: int  # of the whole file
+    antialiased: bool
+    unused: tuple[str, ...]  # elements and properties that say nothing here
 
 
 def begins(head: bytes) -> bool:
@@ -82,8 +85,11 @@ def read(path: Path) -> SplatArrays:
         opacity_logits=logit(colors[:, 3]),
         dc=((_between(chunks, ranges, colors[:, :3]) - COLOR_OFFSET) / Y0).astype(np.float32),
         rest=_harmonics(path, layout),
+        antialiased=layout.antialiased,
     )
-    return checked(path, found)
+    if layout.unused:
+        note(path, f"not used: {', '.join(layout.unused)}")
+    return drawable(path, found)
 
 
 def component_bytes(path: Path) -> dict[str, int]:
@@ -137,7 +143,15 @@ def _layout(path: Path) -> Layout:
             )
         degree = degrees[held]
         _check_row(path, "sh", rows["sh"], ply.numbered("f_rest", held), "u1")
-    return Layout(count, degree, rows, starts, size)
+    known = {"chunk": {*_POSITIONS, *_SCALES, *_COLORS}, "vertex": {*_PACKED}}
+    unused = [f"element {name}" for name in rows if name not in ("chunk", "vertex", "sh")]
+    unused += [
+        f"property {name} of element {element}"
+        for element, names in known.items()
+        for name in rows[element].names or ()
+        if name not in names
+    ]
+    return Layout(count, degree, rows, starts, size, ply.antialiased(lines), tuple(unused))
 
 
 def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[tuple[str, str]]]]:
