@@ -43,14 +43,87 @@ def views_of(folder: Path, **reading: Any) -> dict[str, View]:
 # where masks come from
 
 
-@pytest.mark.parametrize("name", ["a/01.jpg.png", "a/01.png"])
-def test_a_mask_lies_where_colmap_or_the_photographs_name_has_it(write_capture: Write, name: str) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [
+        "masks/a/01.jpg.png",
+        "masks/a/01.png",
+        "masks/a/01.jpg.mask.png",
+        "masks/a/01_mask.png",
+        "Masks/a/01.PNG",
+        "masks/a/01.tif",
+        "images/a/01.jpg.mask.png",
+        "images/a/01_mask.png",
+    ],
+)
+def test_a_mask_has_the_name_that_some_program_gives_it(write_capture: Write, name: str) -> None:
     folder = write_capture([f"a/{i:02d}.jpg" for i in range(4)])
-    write_mask(folder / "masks" / name, masked_box())
+    write_mask(folder / name, masked_box())
     views = views_of(folder)
     np.testing.assert_array_equal(views["a/01.jpg"].mask, masked_box())
     assert [name for name, view in views.items() if view.mask is not None] == ["a/01.jpg"]
-    assert "masks: 1 of 4 views" in load_scene(folder).notes[0]
+    (note,) = load_scene(folder).notes
+    assert "masks: 1 of 4 views" in note
+
+
+def as_alpha(mask: np.ndarray, color: np.ndarray) -> Image.Image:  # color: [H, W, 3] uint8
+    return Image.fromarray(np.dstack([color, mask.astype(np.uint8) * 255]))
+
+
+BLACK, WHITE = (np.full((HEIGHT, WIDTH, 3), value, np.uint8) for value in (0, 255))
+PICTURE = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("color", [BLACK, WHITE, PICTURE], ids=["black", "white", "a picture"])
+def test_a_mask_may_be_the_alpha_channel_of_its_file(write_capture: Write, color: np.ndarray) -> None:
+    folder = write_capture()
+    (folder / "masks").mkdir()
+    as_alpha(masked_box(), color).save(folder / "masks" / "01.png")
+    np.testing.assert_array_equal(views_of(folder)["01.png"].mask, masked_box())
+
+
+def test_a_mask_in_black_and_white_with_an_alpha_channel_leaves_out_what_either_does(
+    write_capture: Write,
+) -> None:
+    folder = write_capture()
+    (folder / "masks").mkdir()
+    left = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    left[:, :8] = True
+    as_alpha(~left, masked_box()[..., None] * WHITE).save(folder / "masks" / "01.png")
+    as_alpha(np.ones_like(left), masked_box()[..., None] * WHITE).save(folder / "masks" / "02.png")
+    views = views_of(folder)
+    np.testing.assert_array_equal(views["01.png"].mask, masked_box() & ~left)
+    np.testing.assert_array_equal(views["02.png"].mask, masked_box())
+
+
+def test_views_of_which_a_mask_leaves_nothing_are_left_out_and_said(write_capture: Write) -> None:
+    folder = write_capture([f"{i:02d}.png" for i in range(17)])
+    nothing = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    for name in ("03.png", "08.png"):
+        write_mask(folder / "masks" / name, nothing)
+    scene = load_scene(folder)
+    assert [view.name for view in scene.test_views] == ["00.png", "16.png"]
+    assert len(scene.train_views) == 13
+    assert "2 views are left out, their masks leave no pixel, such as 03.png" in scene.notes
+    rgba = np.zeros((HEIGHT, WIDTH, 4), dtype=np.uint8)
+    Image.fromarray(rgba).save(folder / "images" / "05.png")
+    assert len(load_scene(folder).train_views) == 12
+
+
+def test_where_the_only_held_out_view_is_masked_away_another_is_held_out(write_capture: Write) -> None:
+    folder = write_capture([f"{i:02d}.png" for i in range(6)])
+    write_mask(folder / "masks" / "00.png", np.zeros((HEIGHT, WIDTH), dtype=bool))
+    scene = load_scene(folder)
+    assert [view.name for view in scene.test_views] == ["01.png"] and len(scene.train_views) == 4
+    assert "1 view is left out, its mask leaves no pixel: 00.png" in scene.notes
+
+
+def test_masks_that_leave_nothing_of_any_view_are_refused(write_capture: Write) -> None:
+    folder = write_capture()
+    for i in range(10):
+        write_mask(folder / "masks" / f"{i:02d}.png", np.zeros((HEIGHT, WIDTH), dtype=bool))
+    with pytest.raises(SceneError, match=r"masks of all 10 views leave no pixel.*invert"):
+        load_scene(folder)
 
 
 def test_masks_of_the_test_views_count_too(write_capture: Write) -> None:

@@ -144,12 +144,12 @@ def test_nerfstudio_lenses_are_undistorted(nerfstudio: Callable[..., Path]) -> N
 LENS = {"k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": -0.005, "k3": 0.04, "k4": 0.007}
 
 
-def test_nerfstudios_coefficients_are_opencvs_by_name(nerfstudio: Callable[..., Path]) -> None:
-    """Where a lens puts a point, by the equations of OpenCV's documentation with nerfstudio's names."""
+def test_nerfstudios_radial_coefficients_are_those_of_one_polynomial(nerfstudio: Callable[..., Path]) -> None:
+    """Where a lens puts a point: k1 to k4 belong to powers of the squared radius, or of a fisheye's squared angle."""
     x, y = 0.5, -0.3
     k1, k2, p1, p2, k3, k4 = LENS.values()
     r2 = x**2 + y**2
-    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2)
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
     expected = (
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
         y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
@@ -261,8 +261,7 @@ def test_images_outside_of_the_scene_are_refused_before_they_are_opened(
     (folder / file).write_text(json.dumps({"camera_angle_x": 0.7, "frames": entries}))
     opened: list[str] = []
     monkeypatch.setattr(images, "image_size", lambda path: opened.append(str(path)) or (WIDTH, HEIGHT))
-    for module in ("blender", "nerfstudio"):
-        monkeypatch.setattr(f"compgs.scene.{module}.image_size", images.image_size)
+    monkeypatch.setattr("compgs.scene.frames.image_size", images.image_size)
     with pytest.raises(
         SceneError, match=r"scene: the image of frame 1 in .* lies outside of the scene's folder"
     ):

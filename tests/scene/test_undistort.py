@@ -22,6 +22,7 @@ COEFFICIENTS = {
     "RADIAL": 2,
     "OPENCV": 4,
     "FULL_OPENCV": 8,
+    "BROWN": 6,
     "OPENCV_FISHEYE": 4,
     "SIMPLE_RADIAL_FISHEYE": 1,
     "RADIAL_FISHEYE": 2,
@@ -33,6 +34,7 @@ LENSES = [
     Distortion("RADIAL", (-0.15, 0.03)),
     Distortion("OPENCV", (-0.2, 0.04, 0.002, -0.003)),
     Distortion("FULL_OPENCV", (0.1, -0.05, 0.001, 0.002, 0.01, 0.12, -0.02, 0.005)),
+    Distortion("BROWN", (-0.15, 0.03, 0.001, 0.002, 0.02, -0.01)),
     Distortion("OPENCV_FISHEYE", (0.02, -0.01, 0.003, -0.001)),
     Distortion("SIMPLE_RADIAL_FISHEYE", (0.05,)),
     Distortion("FOV", (0.9,)),
@@ -57,12 +59,15 @@ def by_hand(x: float, y: float, lens: Distortion) -> tuple[float, float]:
         theta = np.arctan(r)
         bent = theta * (1 + sum(c.get(i, 0.0) * theta ** (2 * i + 2) for i in range(4)))
         return x * bent / r, y * bent / r
-    if "OPENCV" in lens.model:
+    k4 = 0.0
+    if lens.model == "BROWN":
+        k, p1, p2, k4, q = [c[0], c[1], c[4]], c[2], c[3], c[5], [0.0, 0.0, 0.0]
+    elif "OPENCV" in lens.model:
         k, p1, p2 = [c[0], c[1], c.get(4, 0.0)], c[2], c[3]
         q = [c.get(5, 0.0), c.get(6, 0.0), c.get(7, 0.0)]
     else:
         k, p1, p2, q = [c[0], c.get(1, 0.0), 0.0], 0.0, 0.0, [0.0, 0.0, 0.0]
-    above = 1 + k[0] * r**2 + k[1] * r**4 + k[2] * r**6
+    above = 1 + k[0] * r**2 + k[1] * r**4 + k[2] * r**6 + k4 * r**8
     below = 1 + q[0] * r**2 + q[1] * r**4 + q[2] * r**6
     bent_x = x * above / below + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2)
     bent_y = y * above / below + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from compgs.cli.console import say
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import SceneSource
+from compgs.cli.usage import in_words_of_options
 
 if TYPE_CHECKING:
     from compgs.scene import Scene
@@ -27,10 +28,11 @@ def read_scene(source: SceneSource, *, at_once: bool = True) -> "Scene":
             at_once=at_once,
         )
     first = (scene.train_views or scene.test_views)[0].camera
+    rule = f" ({scene.split})" if scene.split else ""
     say(
-        f"{scene.name}: {len(scene.train_views)} training views, {len(scene.test_views)} held out, "
+        f"{scene.name}: {len(scene.train_views)} training views, {len(scene.test_views)} held out{rule}, "
         f"{first.width} x {first.height} pixels, {len(scene.points.positions):,} points"
     )
     for note in scene.notes:
-        say(f"note: {note}")
+        say(f"note: {in_words_of_options(note)}")
     return scene

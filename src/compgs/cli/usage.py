@@ -21,6 +21,10 @@ OF_PYTHON = {
     "images=...": "--images",
     "downscale=...": "-r",
     "test_every=...": "--test-every",
+    "split=": "--hold-out ",
+    "(downscale=auto)": "(-r auto)",
+    "downscale=1 ": "-r 1 ",
+    "images=": "--images ",
 }
 
 

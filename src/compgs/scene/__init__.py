@@ -5,24 +5,38 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from compgs.errors import ConfigError, MissingSparseModel, SceneError
+from compgs.scene.blender import TRAIN as SPLIT_FILE
 from compgs.scene.blender import read_blender
 from compgs.scene.capture import Capture, PosedImage, check_inside
 from compgs.scene.colmap import find_sparse_model
 from compgs.scene.colmap_capture import read_colmap
-from compgs.scene.images import Progress, image_size, load_views
-from compgs.scene.masks import FOLDER as MASKS
-from compgs.scene.masks import find_mask
+from compgs.scene.hold_out import Split, check_split, every, sector
+from compgs.scene.images import (
+    Progress,
+    downscaled_size,
+    image_size,
+    load_views,
+    stored_size,
+    turned_as_cameras_are,
+)
+from compgs.scene.mask_files import with_masks, without_empty
+from compgs.scene.names import Names, without_suffix
 from compgs.scene.nerfstudio import read_nerfstudio
 from compgs.scene.points import MIN_POINTS, fallback_points
-from compgs.scene.unused import unposed_photographs
+from compgs.scene.unused import unposed_photographs, unused_files
 from compgs.scene.views import Points, Scene, View, scene_extent
 
 __all__ = ["Points", "Scene", "View", "as_scene", "extent_of", "load_scene"]
 
+IMAGES = "images"
+AUTO = "auto"
+LARGE = 2_000_000  # pixels of a photograph, from which `downscale="auto"` reduces
+LONGEST_SIDE = 1_600  # pixels that it leaves of the longer side, as 3DGS does
 FALLBACK_POINTS = 20_000  # random points of a scene without sparse points
 MAX_DOWNSCALE = 32  # beyond it somebody means a width in pixels
 
@@ -30,45 +44,65 @@ MAX_DOWNSCALE = 32  # beyond it somebody means a width in pixels
 def load_scene(
     path: str | Path,
     *,
-    downscale: int = 1,  # images at 1 / downscale of their size
-    images: str = "images",  # folder of the images, inside the scene's (COLMAP)
+    downscale: int | Literal["auto"] = 1,  # images at 1 / downscale of their size; auto: at most LONGEST_SIDE
+    images: str = IMAGES,  # folder of the images, inside the scene's (COLMAP)
     test_every: int = 8,  # every n-th of the name-sorted views is held out, the first included
     holdout: bool = True,  # False: all views are trained on
+    split: Split = "auto",  # which views are held out: `scene/hold_out.py`
     background: tuple[float, float, float] | None = None,  # display RGB, 0 to 1; None: the layout's
     progress: Progress | None = None,  # called with (done, total) views
     at_once: bool = True,  # photographs that all fit into memory are decoded now; False: when somebody looks
 ) -> Scene:
-    """Reads a capture: COLMAP, Blender (`transforms_train.json`) or nerfstudio (`transforms.json`).
+    """Reads a capture: COLMAP, nerfstudio (`transforms.json`) or a file for each split (`transforms_train.json`).
 
     What masks and transparent pixels leave out is in the views' `mask` (`compgs.scene.masks`); with a `background` that
-    is given, and in Blender scenes, transparent pixels show it instead.
+    is given, and in Blender scenes, transparent pixels show it instead. Views of which nothing is left are left out.
+    `notes` of the scene name whatever in its folder was not used.
 
     Raises SceneError or one of its kinds for missing, damaged or contradicting data, else ConfigError.
     """
-    check_reading(downscale, test_every, background)
+    check_reading(downscale, test_every, background, split)
     folder = Path(path)
     capture = _read_layout(folder, images)
     _check_views(capture, folder)
     for posed in capture.images:
         check_inside(posed.path, (folder, folder / images), f"the image of the view {posed.name!r}")
-    unposed = unposed_photographs(folder / images, [posed.path for posed in capture.images])
-    capture = _with_masks(capture, folder, images)
-    capture, downscale = _prescaled(capture, folder, images, downscale)
+    capture = with_masks(_turned(capture), folder, images)
+    read = [*capture.files, *(p.path for p in capture.images), *(p.mask for p in capture.images if p.mask)]
+    unused = unposed_photographs(folder / images, read)
+    capture, factor, of_size = _sized(capture, folder, images, downscale)
+    read += [posed.path for posed in capture.images]
+    unused += unused_files(folder, read, (folder / images,))
 
     behind = background or capture.background
     cut_out = capture.cut_out and background is None
-    views = load_views(capture.images, downscale, None if cut_out else behind, progress, at_once=at_once)
-    held_out = _held_out(capture, test_every) if holdout else frozenset()
-    points, notes = _enough_points(capture, views)
+    found, decoded = load_views(
+        capture.images, factor, None if cut_out else behind, progress, at_once=at_once
+    )
+    points, of_points = _enough_points(capture, found)
+    extent = extent_of(found, points)
+    held_out, rule, of_split = (
+        _held_out(capture, found, points, extent, test_every, split)
+        if holdout
+        else (frozenset[str](), "", ())
+    )
+    # Of a capture larger than memory only masks are worth decoding photographs twice.
+    looked_at = [decoded or (at_once and posed.mask is not None) for posed in capture.images]
+    views, of_masks = without_empty(found, looked_at)
+    if held_out and not any(view.name in held_out for view in views):
+        held_out = every([view.name for view in views], test_every)
+    if all(view.name in held_out for view in views):
+        raise SceneError(f"{folder}: all {len(views)} views are held out; name some to train on ({rule})")
     return Scene(
         name=folder.resolve().name,
         train_views=tuple(v for v in views if v.name not in held_out),
         test_views=tuple(v for v in views if v.name in held_out),
         points=points,
         background=behind,
-        extent=extent_of(views, points),
+        extent=extent,
         source=folder,
-        notes=capture.notes + unposed + notes,
+        notes=(*capture.notes, *of_size, *of_split, *of_masks, *of_points, *unused),
+        split=rule,
     )
 
 
@@ -86,12 +120,21 @@ def as_scene(scene: Scene | str | Path) -> Scene:
     )
 
 
-def check_reading(downscale: int, test_every: int, background: tuple[float, float, float] | None) -> None:
+def check_reading(
+    downscale: int | str,
+    test_every: int,
+    background: tuple[float, float, float] | None,
+    split: str = "auto",
+) -> None:
     """Of the arguments of `load_scene`: raises ConfigError for the first that no scene could be read by."""
-    if not 1 <= downscale <= MAX_DOWNSCALE or int(downscale) != downscale:
+    if downscale != AUTO and not (
+        isinstance(downscale, int | float) and 1 <= downscale <= MAX_DOWNSCALE and int(downscale) == downscale
+    ):
         raise ConfigError(
-            f"downscale {downscale}: expected a whole number from 1 to {MAX_DOWNSCALE}, a factor, not a width"
+            f"downscale {downscale}: expected a whole number from 1 to {MAX_DOWNSCALE}, a factor, not a width, or "
+            f"{AUTO}"
         )
+    check_split(split)
     if test_every < 2:
         raise ConfigError(f"test_every {test_every}: expected at least 2, so that views are left to train on")
     if background is not None and not (len(background) == 3 and all(0 <= c <= 1 for c in background)):
@@ -107,17 +150,33 @@ def _read_layout(folder: Path, images: str) -> Capture:
     sparse = find_sparse_model(folder)
     if sparse is not None:
         capture = read_colmap(folder, sparse, folder / images)
-    elif (folder / "transforms_train.json").is_file():
+    elif (folder / SPLIT_FILE).is_file():
         capture = read_blender(folder)
     elif (folder / "transforms.json").is_file():
         capture = read_nerfstudio(folder)
     else:
-        raise MissingSparseModel(
-            f"{folder}: no camera poses found; expected a COLMAP sparse model (cameras.bin, images.bin and "
-            f"points3D.bin in sparse/0), transforms_train.json (Blender) or transforms.json (nerfstudio). "
-            f"For photographs alone, or a video, run: compgs reconstruct {shlex.quote(str(folder))} -o SCENE"
-        )
+        raise MissingSparseModel(_no_poses(folder))
+    if sparse is None and images != IMAGES:
+        note = f"images={images} is not used: {capture.files[0].name} says where the images are"
+        capture = replace(capture, notes=(*capture.notes, note))
     return replace(capture, images=tuple(sorted(capture.images, key=lambda posed: posed.name)))
+
+
+def _no_poses(folder: Path) -> str:
+    """What to do with a folder in which no poses were found: somewhere inside it there may be some."""
+    deeper = [place for pattern in ("*/", "*/*/", "*/*/*/") for place in sorted(folder.glob(pattern))]
+    inside = [p for p in deeper if find_sparse_model(p) == p or (p / "transforms.json").is_file()]
+    if inside:
+        way = f"; there are some in {inside[0].relative_to(folder)}/"
+        return (
+            f"{folder}: no camera poses found where they are expected: a COLMAP sparse model in sparse/0, "
+            f"{SPLIT_FILE} or transforms.json{way}: name the folder of that scene, or put it there, beside {IMAGES}/"
+        )
+    return (
+        f"{folder}: no camera poses found; expected a COLMAP sparse model (cameras.bin, images.bin and "
+        f"points3D.bin in sparse/0), transforms_train.json (Blender) or transforms.json (nerfstudio). "
+        f"For photographs alone, or a video, run: compgs reconstruct {shlex.quote(str(folder))} -o SCENE"
+    )
 
 
 def _check_views(capture: Capture, folder: Path) -> None:
@@ -125,46 +184,48 @@ def _check_views(capture: Capture, folder: Path) -> None:
     for name, following in itertools.pairwise(names):
         if name == following:
             raise SceneError(f"{folder}: the view {name!r} has more than one pose; remove the others")
+    first: dict[Path, str] = {}
+    for posed in capture.images:
+        other = first.setdefault(posed.path, posed.name)
+        if other != posed.name:
+            raise SceneError(
+                f"{folder}: the views {other!r} and {posed.name!r} are one photograph, {posed.path.name}, with more "
+                "than one pose; remove the others"
+            )
     if len(names) < 2:
         raise SceneError(f"{folder}: {len(names)} view with a pose; a scene needs at least 2")
 
 
-def _with_masks(capture: Capture, folder: Path, images: str) -> Capture:
-    """With the files of `masks/`, and what of it is not used. Raises SceneError for masks outside of the scene."""
-    masks = folder / MASKS
-    if masks.is_dir():
-        capture = replace(
-            capture,
-            images=tuple(
-                posed
-                if posed.mask
-                else replace(posed, mask=_mask_of(posed, masks, (folder / images, folder)))
-                for posed in capture.images
-            ),
-        )
-    for posed in capture.images:
-        if posed.mask is not None:
-            check_inside(posed.mask, (folder,), f"the mask of the view {posed.name!r}")
-    masked = sum(posed.mask is not None for posed in capture.images)
-    if not masks.is_dir() and not masked:
+def _turned(capture: Capture) -> Capture:
+    """With images turned by their orientation tag where their cameras are of turned ones, and a sentence about it."""
+    images = turned_as_cameras_are(capture.images)
+    count = sum(posed.turned for posed in images)
+    if not count:
         return capture
-    if masked == 0:
-        note = f"{MASKS}/ is not used: it has a mask for no view; names are as in {images}/, with .png at the end"
-    else:
-        note = (
-            f"masks: {masked} of {len(capture.images)} views have one; where it is black, pixels do not count"
-        )
-    return replace(capture, notes=(*capture.notes, note))
+    note = f"{count} of {len(images)} photographs are turned by their orientation tag: so their cameras are"
+    return replace(capture, images=images, notes=(*capture.notes, note))
 
 
-def _mask_of(posed: PosedImage, masks: Path, folders: tuple[Path, ...]) -> Path | None:
-    """By the name of the photograph relative to the first of the folders that it is in."""
-    for folder in folders:
-        if posed.path.is_relative_to(folder):
-            found = find_mask(masks, str(posed.path.relative_to(folder)))
-            if found is not None:
-                return found
-    return None
+def _sized(
+    capture: Capture, folder: Path, images: str, downscale: int | str
+) -> tuple[Capture, float, tuple[str, ...]]:
+    """The capture, the factor by which its images are to be reduced, and what is to be noted."""
+    if downscale != AUTO:
+        return *_prescaled(capture, folder, images, int(downscale)), ()
+    largest = max(
+        (image_size(posed.path) for posed in capture.images if posed.path.is_file()),
+        key=lambda size: size[0] * size[1],
+        default=(1, 1),
+    )
+    if largest[0] * largest[1] <= LARGE or max(largest) <= LONGEST_SIDE:
+        return capture, 1, ()
+    factor = max(largest) / LONGEST_SIDE
+    width, height = downscaled_size(largest, factor)
+    note = (
+        f"photographs of {largest[0]} x {largest[1]} pixels are read at {width} x {height} (downscale=auto); "
+        "downscale=1 reads all their pixels"
+    )
+    return capture, factor, (note,)
 
 
 def _prescaled(capture: Capture, folder: Path, images: str, downscale: int) -> tuple[Capture, int]:
@@ -172,30 +233,45 @@ def _prescaled(capture: Capture, folder: Path, images: str, downscale: int) -> t
     smaller = folder / f"{images}_{downscale}"
     if downscale == 1 or not smaller.is_dir():
         return capture, downscale
-    swapped = []
+    swapped, names = [], Names()
     for posed in capture.images:
         if not posed.path.is_relative_to(folder / images):
             return capture, downscale
-        path = smaller / posed.path.relative_to(folder / images)
-        if not path.is_file() or not _is_smaller_copy(posed, path, downscale):
-            note = (
-                f"{smaller.name} is not used: {path.name} is missing there or not 1/{downscale} of its size"
-            )
+        name = posed.path.relative_to(folder / images).as_posix()
+        path = names.find(smaller, name) or names.find(smaller, without_suffix(name))
+        if path is None or not _is_smaller_copy(posed, path, downscale):
+            note = f"{smaller.name} is not used: {Path(name).name} is missing there or not 1/{downscale} of its size"
             return replace(capture, notes=(*capture.notes, note)), downscale
-        swapped.append(replace(posed, path=path))
-    return replace(capture, images=tuple(swapped)), 1
+        swapped.append(replace(posed, path=path, turned=False))
+    return replace(capture, images=turned_as_cameras_are(swapped)), 1
 
 
 def _is_smaller_copy(posed: PosedImage, path: Path, downscale: int) -> bool:
-    width, height = image_size(path)
+    size, sideways = stored_size(path)
     camera = posed.camera
-    return abs(width - camera.width / downscale) <= 1 and abs(height - camera.height / downscale) <= 1
+    return any(
+        abs(width - camera.width / downscale) <= 1 and abs(height - camera.height / downscale) <= 1
+        for width, height in (size, size[::-1])[: 1 + sideways]
+    )
 
 
-def _held_out(capture: Capture, test_every: int) -> frozenset[str]:
-    if capture.test_names is not None:
-        return capture.test_names
-    return frozenset(posed.name for posed in capture.images[::test_every])
+def _held_out(
+    capture: Capture, views: Sequence[View], points: Points, extent: float, test_every: int, split: Split
+) -> tuple[frozenset[str], str, tuple[str, ...]]:
+    """Names of the views to hold out, by which rule, in words, and what is to be noted."""
+    names = [view.name for view in views]
+    if split == "auto" and capture.test_names is not None:
+        return capture.test_names, f"by {capture.split}" if capture.split else "", ()
+    notes = (
+        ()
+        if capture.test_names is None
+        else (f"{capture.split}: not followed, as split={split} is asked for",)
+    )
+    if split == "sector":
+        cameras = [view.camera for view in views]
+        chosen = sector(names, cameras, points.positions, extent, test_every)
+        return chosen, f"a sector of {len(chosen)} views around {min(chosen)}", notes
+    return every(names, test_every), f"one in {test_every} by name", notes
 
 
 def _enough_points(capture: Capture, views: list[View]) -> tuple[Points, tuple[str, ...]]:

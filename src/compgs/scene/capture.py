@@ -24,6 +24,7 @@ class PosedImage:
     camera: Camera
     distortion: Distortion | None = None  # None: the image is a pinhole image already
     mask: Path | None = None  # file that says which pixels count (`scene/masks.py`); None: all
+    turned: bool = False  # the camera is of the image as its orientation tag turns it, not as it is stored
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,8 @@ class Capture:
     background: tuple[float, float, float]  # what the layout's images stand on by default
     cut_out: bool = True  # transparent pixels do not count; False: they show the background
     notes: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()  # that were read, beside images and masks
+    split: str = ""  # what names the held-out views; empty: nothing
 
 
 def usable_positions(positions: np.ndarray) -> np.ndarray:  # positions: [P, 3] float64

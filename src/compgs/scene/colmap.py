@@ -8,11 +8,14 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from compgs.errors import MissingSparseModel, SceneError, UnsupportedCamera
+from compgs.scene.names import Names
+from compgs.scene.ply_points import read_ply_points
+from compgs.scene.text_files import read_lines
 
 # model id -> (name, number of parameters); COLMAP's src/colmap/sensor/models.h fixes the numbers
 CAMERA_MODELS = {
@@ -79,53 +82,79 @@ class SparseModel:
     cameras: dict[int, ColmapCamera]  # by camera id
     images: tuple[ColmapImage, ...]  # in the order of the file
     points: ColmapPoints
+    files: tuple[Path, ...] = ()  # that were read
 
 
 def find_sparse_model(folder: Path) -> Path | None:
     """The folder of the sparse model: `sparse/0`, `sparse` or the folder itself; None where there is none."""
     for candidate in (folder / "sparse" / "0", folder / "sparse", folder):
-        if any(
-            (candidate / f"{part}.{kind}").is_file()
-            for part in ("cameras", "images")
-            for kind in ("bin", "txt")
-        ):
+        if any(part_file(candidate, part) for part in ("cameras", "images")):
             return candidate
     return None
 
 
+def part_file(folder: Path, part: str) -> Path | None:
+    """`cameras`, `images` or `points3D` of a model, .bin before .txt, in any letter case."""
+    names = Names()
+    found = (names.find(folder, f"{part}.{kind}", ()) for kind in ("bin", "txt"))
+    return next((file for file in found if file is not None), None)
+
+
+def model_files(folder: Path) -> dict[str, Path]:
+    """The file of each part that there is: of one kind where that has all three, binary before text."""
+    names = Names()
+    for kind in ("bin", "txt"):
+        files = {part: names.find(folder, f"{part}.{kind}", ()) for part in _PARTS}
+        whole = {part: file for part, file in files.items() if file is not None}
+        if len(whole) == len(_PARTS):
+            return whole
+    return {part: file for part in _PARTS if (file := part_file(folder, part)) is not None}
+
+
 def read_sparse_model(folder: Path) -> SparseModel:
-    """Reads cameras, images and points3D; the binary files are preferred where all three exist."""
-    kinds = [k for k in ("bin", "txt") if all((folder / f"{p}.{k}").is_file() for p in _PARTS)]
-    if not kinds:
-        kind = max(("bin", "txt"), key=lambda k: sum((folder / f"{p}.{k}").is_file() for p in _PARTS))
-        missing = next(p for p in _PARTS if not (folder / f"{p}.{kind}").is_file())
+    """Reads cameras, images and points3D; the binary files are preferred where all three exist.
+
+    Without points3D, points are those of a points3D.ply, as 3DGS makes it. Raises MissingSparseModel, SceneError.
+    """
+    files = model_files(folder)
+    if "points3D" not in files and (ply := points_ply(folder)) is not None:
+        files["points3D"] = ply
+    missing = [part for part in _PARTS if part not in files]
+    if missing:
+        there = ", ".join(file.name for file in files.values()) or "none of them"
         raise MissingSparseModel(
-            f"{folder}: {missing}.bin (or .txt) is missing; a sparse model is the three files cameras, "
-            f"images and points3D, as `colmap mapper` writes them"
+            f"{folder}: {missing[0]}.bin (or .txt) is missing; a sparse model is the three files cameras, "
+            f"images and points3D, as `colmap mapper` writes them, found: {there}"
         )
-    binary = kinds[0] == "bin"
-    cameras_file, images_file, points_file = (folder / f"{p}.{kinds[0]}" for p in _PARTS)
-    cameras = _guarded(read_cameras_binary if binary else read_cameras_text, cameras_file)
-    images = _guarded(read_images_binary if binary else read_images_text, images_file)
-    points = _guarded(read_points_binary if binary else read_points_text, points_file)
+    cameras = _guarded(_READERS["cameras", files["cameras"].suffix.lower()], files["cameras"])
+    images = _guarded(_READERS["images", files["images"].suffix.lower()], files["images"])
+    points = _guarded(_READERS["points3D", files["points3D"].suffix.lower()], files["points3D"])
     for image in images:
         if image.camera_id not in cameras:
             raise SceneError(
-                f"{images_file}: image {image.name!r} was taken by camera {image.camera_id}, but "
-                f"{cameras_file.name} only knows {', '.join(map(str, sorted(cameras))) or 'none'}; "
+                f"{files['images']}: image {image.name!r} was taken by camera {image.camera_id}, but "
+                f"{files['cameras'].name} only knows {', '.join(map(str, sorted(cameras))) or 'none'}; "
                 f"export the model again"
             )
-    return SparseModel(folder, cameras, images, points)
+    return SparseModel(folder, cameras, images, points, tuple(files.values()))
+
+
+def points_ply(folder: Path) -> Path | None:
+    """Points as 3DGS keeps them beside a model, which COLMAP does not know."""
+    return Names().find(folder, "points3D.ply", ())
 
 
 def count_images(folder: Path) -> int:
     """Registered images of a sparse model, from as little of it as possible; 0 where there is none to be read."""
+    file = part_file(folder, "images")
     try:
-        if (folder / "images.bin").is_file():
-            with (folder / "images.bin").open("rb") as file:
-                promised = int.from_bytes(file.read(_COUNT.size), "little")
-            return min(promised, (folder / "images.bin").stat().st_size // _POSE.size)
-        return sum(len(line.split()) == 10 for _, line in _content_lines(folder / "images.txt"))
+        if file is None:
+            return 0
+        if file.suffix.lower() == ".bin":
+            with file.open("rb") as content:
+                promised = int.from_bytes(content.read(_COUNT.size), "little")
+            return min(promised, file.stat().st_size // _POSE.size)
+        return sum(len(line.split()) == 10 for _, line in _content_lines(file))
     except OSError:
         return 0
 
@@ -263,18 +292,26 @@ def read_cameras_text(file: Path) -> dict[int, ColmapCamera]:
 
 def read_images_text(file: Path) -> tuple[ColmapImage, ...]:
     images = []
-    lines = iter(enumerate(_lines(file), start=1))
-    for number, line in lines:
+    lines = read_lines(file)
+    index = 0
+    while index < len(lines):
+        line, number = lines[index], index + 1
+        index += 1
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         with _Line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
             fields = line.strip().split(maxsplit=9)  # at most: the name may hold spaces
             pose = np.array([float(v) for v in fields[1:8]])
             image_id, camera_id, name = int(fields[0]), int(fields[8]), fields[9]
-        # The line after a pose holds its observations, even when it is empty.
-        number, line = next(lines, (number + 1, ""))
-        with _Line(file, number, "X Y POINT3D_ID, repeated"):
-            seen = np.array(line.split()).reshape(-1, 3)
+        # The line after a pose holds its observations, even when it is empty. Where somebody took out the empty
+        # lines, it is the next pose.
+        following = lines[index] if index < len(lines) else ""
+        if _is_pose(following):
+            following = ""
+        else:
+            index += 1
+        with _Line(file, number + 1, "X Y POINT3D_ID, repeated"):
+            seen = np.array(following.split()).reshape(-1, 3)
             observations = seen[:, :2].astype(np.float64)
             point_ids = seen[:, 2].astype(np.int64)
         images.append(ColmapImage(image_id, pose[:4], pose[4:], camera_id, name, observations, point_ids))
@@ -302,6 +339,19 @@ def read_points_text(file: Path) -> ColmapPoints:
     )
 
 
+def _is_pose(line: str) -> bool:
+    """Whether a line of images.txt has a name at its end, which observations, triples of numbers, have not."""
+    fields = line.split(maxsplit=9)
+    if len(fields) < 10 or line.lstrip().startswith("#"):
+        return False
+    try:
+        [float(field) for field in fields[:9]]
+        [float(field) for field in fields[9].split()]
+    except ValueError:
+        return all(field.lstrip("-").isdigit() for field in (fields[0], fields[8]))
+    return False
+
+
 class _Line:
     """Turns whatever goes wrong while one line is parsed into an error that names the line."""
 
@@ -318,14 +368,33 @@ class _Line:
             ) from error
 
 
-def _lines(file: Path) -> list[str]:
-    return file.read_text(encoding="utf-8", errors="surrogateescape").split("\n")
-
-
 def _content_lines(file: Path) -> Iterator[tuple[int, str]]:
-    for number, line in enumerate(_lines(file), start=1):
+    for number, line in enumerate(read_lines(file), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield number, line
+
+
+# Points as 3DGS keeps them
+
+
+def read_points_ply(file: Path) -> ColmapPoints:
+    """Positions and colors; ids in the order of the file, errors unknown."""
+    points = read_ply_points(file)
+    count = len(points)
+    return ColmapPoints(
+        np.arange(1, count + 1, dtype=np.uint64), points.positions, points.colors, np.full(count, -1.0)
+    )
+
+
+_READERS: dict[tuple[str, str], Callable[[Path], Any]] = {
+    ("cameras", ".bin"): read_cameras_binary,
+    ("cameras", ".txt"): read_cameras_text,
+    ("images", ".bin"): read_images_binary,
+    ("images", ".txt"): read_images_text,
+    ("points3D", ".bin"): read_points_binary,
+    ("points3D", ".txt"): read_points_text,
+    ("points3D", ".ply"): read_points_ply,
+}
 
 
 def _unknown_model(file: Path, camera_id: int, model: int | str) -> UnsupportedCamera:

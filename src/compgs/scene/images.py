@@ -1,6 +1,7 @@
 """Photographs from disk: checked against their cameras, composited, undistorted, resized, kept as uint8."""
 
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -9,13 +10,14 @@ from threading import Lock
 from typing import TypeVar
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from compgs.cameras import Camera
 from compgs.errors import ConfigError, SceneError, UnreadableImage, UnsupportedCamera
 from compgs.scene.capture import PosedImage
 from compgs.scene.image_cache import ImageCache
-from compgs.scene.masks import OPAQUE, mask_of_brightness, resized_mask, undistorted_mask
+from compgs.scene.masks import mask_of, resized_mask, undistorted_mask
+from compgs.scene.pixels import REMEDY, UnusableSamples, has_alpha, is_wide, rgb
 from compgs.scene.undistort import sample_bicubic, undistorted_camera, undistortion_map
 from compgs.scene.views import View
 
@@ -31,15 +33,25 @@ DAMAGED = (OSError, ValueError, SyntaxError, EOFError, IndexError, MemoryError, 
 
 MIN_SIDE = 4  # pixels: what downscaling must leave of an image
 
+# The tag of how a picture is to be turned, and its values that swap width and height.
+ORIENTATION, SIDEWAYS = 0x0112, (5, 6, 7, 8)
+
+_opening = Lock()  # filters of warnings belong to the process
+
 Progress = Callable[[int, int], None]  # done, total
 _Result = TypeVar("_Result")
 
 
 def image_size(file: Path) -> tuple[int, int]:
     """(width, height) in pixels, from the header alone. Raises UnreadableImage."""
+    return stored_size(file)[0]
+
+
+def stored_size(file: Path) -> tuple[tuple[int, int], bool]:
+    """(width, height) in pixels, and whether the orientation tag swaps the two. Raises UnreadableImage."""
     try:
         with open_image(file) as image:
-            return image.size
+            return image.size, image.getexif().get(ORIENTATION) in SIDEWAYS
     except DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
 
@@ -58,20 +70,21 @@ class Photograph:
 
 def load_views(
     images: Sequence[PosedImage],
-    downscale: int,
+    downscale: float,
     background: tuple[float, float, float] | None,  # behind transparent pixels; None: these do not count
     progress: Progress | None = None,
     cache: ImageCache[Photograph] | None = None,
     *,
     at_once: bool = True,
-) -> list[View]:
-    """The views at 1 / downscale of their images' size, in the given order, with their masks.
+) -> tuple[list[View], bool]:
+    """The views at 1 / downscale of their images' size, in the given order, with their masks; whether all are decoded.
 
     Headers, sizes and cameras are checked. Images that all fit into the cache are decoded at once, and so checked; of a
     larger capture, or if not `at_once`, each is decoded when its view is looked at.
     """
     cache = cache or ImageCache()
-    cameras = _checked_cameras(images)
+    sizes = _checked_sizes(images)
+    cameras = [posed.camera.resized(*size) for posed, size in zip(images, sizes, strict=True)]
     for posed, camera in zip(images, cameras, strict=True):
         width, height = downscaled_size((camera.width, camera.height), downscale)
         if downscale > 1 and min(width, height) < MIN_SIDE:
@@ -108,9 +121,10 @@ def load_views(
         return View(images[index].name, camera.resized(width, height), stored.image, stored.mask)
 
     views = _in_threads(view, len(images), None)
-    if at_once and sum(3 * view.camera.width * view.camera.height for view in views) <= cache.most_bytes:
+    fit = sum(3 * view.camera.width * view.camera.height for view in views) <= cache.most_bytes
+    if at_once and fit:
         _in_threads(lambda index: views[index].image.shape, len(images), progress)
-    return views
+    return views, at_once and fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,14 +142,14 @@ class _Stored:
         return self.cache.get(self.index, lambda: self.read(self.index)).mask
 
 
-def downscaled_size(size: tuple[int, int], downscale: int) -> tuple[int, int]:
+def downscaled_size(size: tuple[int, int], downscale: float) -> tuple[int, int]:
     """(width, height) of an image at 1 / downscale of its size, rounded to whole pixels."""
     return max(1, round(size[0] / downscale)), max(1, round(size[1] / downscale))
 
 
 def read_photograph(posed: PosedImage, background: tuple[float, float, float] | None) -> Photograph:
     """The pixels of an image, and which of them count by its transparency and its mask. Raises UnreadableImage."""
-    image, mask = read_image(posed.path, background)
+    image, mask = read_image(posed.path, background, turned=posed.turned)
     if posed.mask is not None:
         size = image.shape[1], image.shape[0]
         own = resized_mask(_read_mask(posed.mask, posed.path, size), size)
@@ -144,17 +158,18 @@ def read_photograph(posed: PosedImage, background: tuple[float, float, float] | 
 
 
 def read_image(
-    file: Path, background: tuple[float, float, float] | None
+    file: Path, background: tuple[float, float, float] | None, *, turned: bool = False
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """[H, W, 3] uint8 RGB, and [H, W] bool, True where more than half opaque. Raises UnreadableImage.
+    """[H, W, 3] uint8 RGB, and [H, W] bool, True where more than half opaque (`rgb`). Raises UnreadableImage.
 
-    With a background, transparent images are composited on it, and there is no mask; nor is there for opaque images.
-    The orientation tag is ignored, as structure from motion ignores it: poses belong to the stored pixels.
+    The orientation tag is ignored unless `turned`, as structure from motion ignores it: poses belong to the stored
+    pixels.
     """
     try:
         with open_image(file) as image:
+            wide = is_wide(image)
             image.load()
-            return _rgb(image, background)
+            return rgb(ImageOps.exif_transpose(image) if turned else image, background, wide=wide)
     except DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
 
@@ -163,50 +178,57 @@ def _read_mask(file: Path, photograph: Path, size: tuple[int, int]) -> np.ndarra
     """[H, W] bool, of the file's own size, which must have the proportions of `size`. Raises UnreadableImage."""
     try:
         with open_image(file) as image:
+            upright = ImageOps.exif_transpose(image)
+            if _stretch(upright.size, size) < _stretch(image.size, size):
+                image = upright  # as its photograph, whose camera is of the turned picture
             width, height = image.size
-            if abs(width / size[0] - height / size[1]) > 1 / size[0] + 1 / size[1]:
+            if _stretch(image.size, size) > 1 / size[0] + 1 / size[1]:
                 raise UnreadableImage(
                     f"{file}: the mask has {width}x{height} pixels, its photograph {photograph.name} "
                     f"{size[0]}x{size[1]}; make a mask of the photograph's proportions"
                 )
-            gray = image if image.mode.startswith("I") or image.mode == "F" else image.convert("L")
-            return mask_of_brightness(np.asarray(gray))
+            return mask_of(*_gray_and_alpha(image))
     except DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
 
 
+def _stretch(size: tuple[int, int], other: tuple[int, int]) -> float:
+    """How far two sizes are from the same proportions."""
+    return abs(size[0] / other[0] - size[1] / other[1])
+
+
+def _gray_and_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
+    """[H, W] each, of any type; no alpha where the image has none."""
+    if image.mode.startswith("I") or image.mode == "F":
+        return np.asarray(image), None
+    if not has_alpha(image):
+        return np.asarray(image.convert("L")), None
+    rgba = image.convert("RGBA")
+    return np.asarray(rgba.convert("RGB").convert("L")), np.asarray(rgba)[..., 3]
+
+
 def open_image(file: Path) -> Image.Image:
-    """Opened, if of one of the FORMATS that this Pillow has; only the header is read. Raises what is in DAMAGED."""
+    """Opened, if of one of the FORMATS that this Pillow has; only the header is read. Raises what is in DAMAGED.
+
+    Pillow refuses images of more than 179 megapixels. It warns of those of half as many, which are usual: not shown.
+    """
     Image.init()
-    return Image.open(file, formats=[name for name in FORMATS if name in Image.OPEN])
+    formats = [name for name in FORMATS if name in Image.OPEN]
+    with _opening, warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return Image.open(file, formats=formats)
 
 
-def _rgb(
-    image: Image.Image, background: tuple[float, float, float] | None
-) -> tuple[np.ndarray, np.ndarray | None]:
-    if image.mode.startswith("I") or image.mode == "F":  # 16 bits per sample, gray
-        gray = np.asarray(image).astype(np.float64)
-        eight = np.clip(np.round(gray / 257), 0, 255).astype(np.uint8)
-        return np.repeat(eight[:, :, None], 3, axis=2), None
-    if "A" in image.getbands() or "transparency" in image.info:
-        rgba = np.asarray(image.convert("RGBA"))
-        if background is None:
-            return np.ascontiguousarray(rgba[:, :, :3]), rgba[:, :, 3] > OPAQUE
-        alpha = rgba[:, :, 3:].astype(np.float32) / 255
-        behind = np.asarray(background, dtype=np.float32) * 255
-        return np.round(rgba[:, :, :3] * alpha + behind * (1 - alpha)).astype(np.uint8), None
-    return np.array(image.convert("RGB")), None
-
-
-def _checked_cameras(images: Sequence[PosedImage]) -> list[Camera]:
-    """The cameras at the sizes of the files. Raises for missing or unreadable files and for wrong sizes."""
+def _checked_sizes(images: Sequence[PosedImage]) -> list[tuple[int, int]]:
+    """(width, height) of the files, as the cameras see them. Raises for missing or unreadable files and wrong sizes."""
     missing = [posed for posed in images if not posed.path.is_file()]
     if missing:
         raise UnreadableImage(
             f"{missing[0].path}: this view's image does not exist{_more(len(missing) - 1, 'missing')}; "
             f"put the images there, or name their folder with images=..."
         )
-    sizes = _in_threads(lambda index: image_size(images[index].path), len(images), None)
+    found = _in_threads(lambda index: stored_size(images[index].path), len(images), None)
+    sizes = [size[::-1] if posed.turned else size for posed, (size, _) in zip(images, found, strict=True)]
     wrong = [i for i, posed in enumerate(images) if not fits(sizes[i], posed.camera)]
     if wrong:
         posed, (width, height) = images[wrong[0]], sizes[wrong[0]]
@@ -215,7 +237,22 @@ def _checked_cameras(images: Sequence[PosedImage]) -> list[Camera]:
             f"{posed.camera.width}x{posed.camera.height}{_more(len(wrong) - 1, 'of the wrong size')}; "
             f"use the images that the poses were computed from, or a uniformly smaller copy of them"
         )
-    return [posed.camera.resized(*size) for posed, size in zip(images, sizes, strict=True)]
+    return sizes
+
+
+def turned_as_cameras_are(images: Sequence[PosedImage]) -> tuple[PosedImage, ...]:
+    """The images; those whose cameras fit them only as their orientation tag turns them, so turned.
+
+    Structure from motion mostly ignores the tag, and cameras are of the images as stored; some programs heed it.
+    """
+    there = [index for index, posed in enumerate(images) if posed.path.is_file()]
+    sizes = _in_threads(lambda i: stored_size(images[there[i]].path), len(there), None)
+    turned = {i for i, found in zip(there, sizes, strict=True) if _only_turned(images[i].camera, *found)}
+    return tuple(replace(posed, turned=True) if i in turned else posed for i, posed in enumerate(images))
+
+
+def _only_turned(camera: Camera, size: tuple[int, int], sideways: bool) -> bool:
+    return sideways and not fits(size, camera) and fits(size[::-1], camera)
 
 
 def fits(size: tuple[int, int], camera: Camera) -> bool:
@@ -291,5 +328,32 @@ def _reason(file: Path, error: BaseException) -> str:
         )
     if isinstance(error, Image.DecompressionBombError):
         return f"{file}: the image is too large ({error}); give smaller copies of all images"
+    if isinstance(error, UnusableSamples):
+        return f"{file}: {error}"
+    if isinstance(error, UnidentifiedImageError) and (kind := kind_of(file)):
+        return f"{file}: {kind} is not read; {REMEDY}"
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return f"{file}: the image cannot be read ({reason}); restore it, or remove the view from the poses"
+
+
+# How files begin that are whole, and not among the FORMATS or not of a kind of them that Pillow opens.
+KINDS = {
+    b"II*\0": "a TIFF of this kind (perhaps of floating-point or 32-bit samples)",
+    b"MM\0*": "a TIFF of this kind (perhaps of floating-point or 32-bit samples)",
+    b"\x76\x2f\x31\x01": "OpenEXR",
+    b"#?RADIANCE": "Radiance HDR",
+    b"#?RGBE": "Radiance HDR",
+    b"PF\n": "a portable float map",
+    b"Pf\n": "a portable float map",
+    b"8BPS": "a Photoshop document",
+}
+
+
+def kind_of(file: Path) -> str:
+    """What a file is that cannot be opened although it is whole; empty where that is not known."""
+    try:
+        with file.open("rb") as content:
+            head = content.read(12)
+    except OSError:
+        return ""
+    return next((name for start, name in KINDS.items() if head.startswith(start)), "")

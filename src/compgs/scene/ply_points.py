@@ -1,5 +1,6 @@
 """Sparse points of a .ply file: what nerfstudio writes beside its poses."""
 
+import codecs
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ _GRAY = 128
 def read_ply_points(file: Path) -> Points:
     """Positions and colors (else gray) of the vertices, ascii or binary. Raises SceneError."""
     try:
-        data = file.read_bytes()
+        data = file.read_bytes().removeprefix(codecs.BOM_UTF8)
     except OSError as error:
         raise SceneError(f"{file}: cannot be read ({error.strerror or error})") from error
     end = data.find(b"end_header")

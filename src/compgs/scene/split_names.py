@@ -1,11 +1,11 @@
-"""The split that nerfstudio's `transforms.json` may name: `train_filenames`, `val_filenames`, `test_filenames`."""
+"""Splits that a capture names: lists in nerfstudio's `transforms.json`, or files beside a COLMAP model."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from compgs.errors import SceneError
 from compgs.scene.capture import PosedImage
-from compgs.scene.transforms import as_name
+from compgs.scene.names import as_name, matches
 
 LISTS = ("train_filenames", "val_filenames", "test_filenames")
 
@@ -15,21 +15,33 @@ def split_by_names(
 ) -> tuple[tuple[PosedImage, ...], frozenset[str] | None, tuple[str, ...]]:
     """The frames to use, the names of those that are held out (None: no list is given), and what is to be noted.
 
-    Held out is what `val_filenames` or `test_filenames` have, or, without both, what `train_filenames` does not have.
-    Where both what is trained on and what is held out are named, other frames are left out, as nerfstudio does.
     Raises SceneError for what is no list of names.
     """
     lists = {key: _names(values[key], key, place) for key in LISTS if values.get(key) is not None}
+    return split_by_lists(posed, lists, LISTS[0])
+
+
+def split_by_lists(
+    posed: Sequence[PosedImage], lists: Mapping[str, frozenset[str]], training: str
+) -> tuple[tuple[PosedImage, ...], frozenset[str] | None, tuple[str, ...]]:
+    """As `split_by_names`, of lists by what they are called; `training` is the one of frames to train on.
+
+    Held out is what the other lists have, or, without any, what the list of training frames does not have. Where both
+    what is trained on and what is held out are named, other frames are left out, as nerfstudio does.
+    """
     if not lists:
         return tuple(posed), None, ()
-    frames, named = {image.name for image in posed}, frozenset().union(*lists.values())
-    train = lists.get("train_filenames")
-    evaluated = [names for key, names in lists.items() if key != "train_filenames"]
-    held_out = frozenset(frames & frozenset().union(*evaluated) if evaluated else frames - named)
+    frames = {image.name for image in posed}
+    found = {key: matches(names, frames) for key, names in lists.items()}
+    meant = {key: frozenset(names.values()) for key, names in found.items()}
+    named = frozenset().union(*meant.values())
+    train = meant.get(training)
+    evaluated = [names for key, names in meant.items() if key != training]
+    held_out = frozenset().union(*evaluated) if evaluated else frozenset(frames - named)
     used = tuple(image for image in posed if not (train and evaluated) or image.name in named)
     notes = []
-    if named - frames:
-        notes.append(f"of {len(named - frames)} names there is no frame, such as {min(named - frames)!r}")
+    if strange := sorted(name for key, names in lists.items() for name in names - found[key].keys()):
+        notes.append(f"of {len(strange)} names there is no frame, such as {strange[0]!r}")
     if both := (train or frozenset()) & held_out:
         notes.append(f"{len(both)} frames are named as trained on and as held out: they are held out")
     if len(used) < len(posed):

@@ -1,6 +1,5 @@
-"""What the two JSON layouts share: reading the file, and poses in the axes of OpenGL."""
+"""What the layouts with poses in JSON share: reading the file, and poses in the axes of OpenGL."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,18 +7,13 @@ import numpy as np
 
 from compgs.errors import SceneError, UnsupportedCamera
 from compgs.numerics.rotations import nearest_rotation, rigid
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".webp")
+from compgs.scene.names import as_name
+from compgs.scene.text_files import read_json
 
 
 def read_transforms(file: Path) -> dict[str, Any]:
     """The JSON object of the file, which has a list of `frames`. Raises SceneError."""
-    try:
-        values = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SceneError(f"{file}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, RecursionError) as error:
-        raise SceneError(f"{file}: is not valid JSON ({error}); export it again") from error
+    values = read_json(file)
     frames = values.get("frames") if isinstance(values, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise SceneError(f"{file}: expected an object with a list of frames; export it again")
@@ -31,7 +25,7 @@ def number(values: dict[str, Any], key: str, place: str) -> float:
     value = values.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise SceneError(
-            f"{place}: {key} is {'missing' if value is None else value!r}; expected a finite number"
+            f"{place}: {key} is {'missing' if value is None else repr(value)}; expected a finite number"
         )
     return float(value)
 
@@ -42,11 +36,6 @@ def file_path(frame: dict[str, Any], place: str, key: str = "file_path") -> str:
     if not isinstance(value, str) or not value:
         raise SceneError(f"{place}: {key} is {value!r}; expected the path of the frame's image")
     return as_name(value)
-
-
-def as_name(path: str) -> str:
-    """A path as the names of views are written."""
-    return path.replace("\\", "/").removeprefix("./")
 
 
 def world_to_camera(frame: dict[str, Any], place: str) -> np.ndarray:

@@ -18,6 +18,7 @@ MODELS = (
     "RADIAL",
     "OPENCV",
     "FULL_OPENCV",
+    "BROWN",
     "OPENCV_FISHEYE",
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
@@ -27,7 +28,10 @@ MODELS = (
 
 @dataclass(frozen=True)
 class Distortion:
-    """A lens: the model's name as COLMAP spells it, and its distortion coefficients in COLMAP's order."""
+    """A lens: the model's name as COLMAP spells it, and its distortion coefficients in COLMAP's order.
+
+    BROWN is none of COLMAP's: k1, k2, p1, p2, k3, k4, where k4 belongs to the eighth power of the radius (nerfstudio).
+    """
 
     model: str  # one of MODELS
     coefficients: tuple[float, ...]
@@ -43,24 +47,31 @@ def distort(x: np.ndarray, y: np.ndarray, lens: Distortion) -> tuple[np.ndarray,
     c = lens.coefficients
     if lens.model in ("SIMPLE_RADIAL", "RADIAL"):
         k1, k2 = (*c, 0.0)[:2]
-        return _brown_conrady(x, y, (k1, k2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        return _brown_conrady(x, y, (k1, k2, 0.0, 0.0, 0.0, 0.0))
     if lens.model == "OPENCV":
         k1, k2, p1, p2 = c
-        return _brown_conrady(x, y, (k1, k2, p1, p2, 0.0, 0.0, 0.0, 0.0))
-    if lens.model == "FULL_OPENCV":
+        return _brown_conrady(x, y, (k1, k2, p1, p2, 0.0, 0.0))
+    if lens.model == "BROWN":
         return _brown_conrady(x, y, c)
+    if lens.model == "FULL_OPENCV":
+        k1, k2, p1, p2, k3, *denominator = c
+        return _brown_conrady(x, y, (k1, k2, p1, p2, k3, 0.0), tuple(denominator))
     if lens.model == "FOV":
         return _field_of_view(x, y, c[0])
     return _fisheye(x, y, (*c, 0.0, 0.0, 0.0, 0.0)[:4])
 
 
 def _brown_conrady(
-    x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]
+    x: np.ndarray,
+    y: np.ndarray,
+    coefficients: tuple[float, ...],  # k1, k2, p1, p2, k3, k4
+    denominator: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rational radial and tangential distortion (OpenCV's calib3d documentation)."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
+    """Radial polynomial, perhaps over another, and tangential distortion (OpenCV's calib3d documentation)."""
+    k1, k2, p1, p2, k3, k4 = coefficients
+    d1, d2, d3 = denominator
     r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))) / (1 + r2 * (d1 + r2 * (d2 + r2 * d3)))
     xy = 2 * x * y
     return (
         x * radial + p1 * xy + p2 * (r2 + 2 * x * x),

@@ -7,6 +7,12 @@ from compgs.scene.colmap import count_images
 
 # Of photographs, also those that cannot be read.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".jp2")
+# Files about a capture, not of it, by the beginning of their names.
+ABOUT = ("license", "licence", "readme", "copying", "notice", "citation")
+# What `compgs reconstruct` and file managers leave.
+BYPRODUCTS = ("reconstruction.json", "reconstruction.png", "thumbs.db", "desktop.ini")
+MOST_NAMED = 12
+FEW = 3  # files of one folder that are named one by one
 
 
 def unposed_photographs(folder: Path, used: Iterable[Path]) -> tuple[str, ...]:
@@ -20,6 +26,49 @@ def unposed_photographs(folder: Path, used: Iterable[Path]) -> tuple[str, ...]:
         return ()
     count = f"{len(missing)} photograph{'s have' if len(missing) > 1 else ' has'} no pose and"
     return (f"{folder.name}/: {count} will not be used, such as {missing[0]}",)
+
+
+def unused_files(folder: Path, used: Iterable[Path], said: Iterable[Path] = ()) -> tuple[str, ...]:
+    """A sentence that names everything in the folder of a scene that was not read, if there is anything.
+
+    Folders of which nothing was read are named as a whole, many files of one folder are counted. `said`: folders whose
+    photographs another sentence speaks of.
+    """
+    read = set(used)
+    around = {parent for path in read for parent in path.parents}
+    names = list(_unused_in(folder, folder, read, around, frozenset(said)))
+    if not names:
+        return ()
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return (f"not used: {', '.join(names[:MOST_NAMED])}{more}",)
+
+
+def _unused_in(
+    place: Path, folder: Path, read: set[Path], around: set[Path], said: frozenset[Path]
+) -> Iterable[str]:
+    files, folders, inside = [], [], []
+    for entry in sorted(place.iterdir()):
+        if entry.name.startswith(".") or entry in read or _is_about(entry):
+            continue
+        if entry in around:
+            inside.append(entry)
+        elif entry.is_dir():
+            folders.append(entry)
+        elif not (place in said and entry.suffix.lower() in SUFFIXES):
+            files.append(entry)
+    if len(files) > FEW and place != folder:
+        example = files[0].relative_to(folder)
+        yield f"{len(files)} files in {place.relative_to(folder)}/, such as {example.name}"
+    else:
+        yield from (str(file.relative_to(folder)) for file in files)
+    yield from (f"{entry.relative_to(folder)}/" for entry in folders if entry not in said)
+    for entry in inside:
+        yield from _unused_in(entry, folder, read, around, said | {entry} if place in said else said)
+
+
+def _is_about(file: Path) -> bool:
+    name = file.name.lower()
+    return name in BYPRODUCTS or (name.startswith(ABOUT) and file.is_file())
 
 
 def larger_models(sparse: Path, registered: int) -> tuple[str, ...]:

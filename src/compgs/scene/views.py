@@ -55,6 +55,7 @@ class Scene:
     extent: float  # world units: 1.1 x the largest distance of a camera from their mean (3DGS)
     source: Path  # the folder that was read
     notes: tuple[str, ...] = ()  # what was decided or replaced on loading, one sentence each
+    split: str = ""  # how the held-out views were chosen, in words; empty: not known, or none is held out
 
 
 def scene_extent(centers: np.ndarray) -> float:  # centers: [V, 3]
