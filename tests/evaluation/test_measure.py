@@ -194,6 +194,23 @@ def test_lpips_is_measured_in_both_conventions_where_it_is_asked_for(
     assert results.per_view_list()[1]["lpips_3dgs"] == results.per_view[1].lpips_3dgs
 
 
+def test_errors_are_accounted_for_where_that_is_asked_for(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = make_scene([101, 110])
+    assert evaluate(file, scene, device="cpu").errors is None
+    monkeypatch.setattr(
+        "compgs.evaluation.measure.depth", lambda _, camera: np.ones((camera.height, camera.width))
+    )
+    results = evaluate(file, scene, errors=True, output=tmp_path / "report", device="cpu")
+    written = json.loads((tmp_path / "report" / "errors.json").read_text())
+    assert results.errors is not None and written == json.loads(json.dumps(results.errors.to_dict()))
+    assert written["views"][0]["name"] == min(results.per_view, key=lambda view: view.psnr).name
+    assert written["views"][0]["psnr"] == pytest.approx(min(view.psnr for view in results.per_view))
+    with Image.open(tmp_path / "report" / "errors.png") as picture:
+        assert picture.width > 1000
+
+
 def test_a_perfect_rendering_is_written_as_valid_json(file: Path, tmp_path: Path) -> None:
     results = evaluate(file, make_scene([100]), output=tmp_path / "report", device="cpu")
     assert results.psnr == math.inf

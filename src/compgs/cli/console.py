@@ -15,9 +15,12 @@ from compgs.words import duration, size
 if TYPE_CHECKING:
     from compgs.codec.reader import RangeInfo
     from compgs.evaluation.comparison import Comparison
+    from compgs.evaluation.error_account import ErrorAccount, Part, ScalePart
     from compgs.evaluation.reduction import Reduction
     from compgs.evaluation.results import Results
     from compgs.formats.tiled import TileEntry
+
+WORST_VIEWS = 5  # that are named
 
 console = Console(highlight=False, soft_wrap=True)
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -130,6 +133,45 @@ def print_results(results: "Results") -> None:
         "bits/splat": results.splats,
     }
     _print_shares(results.components, {name: n for name, n in counts.items() if n is not None})
+
+
+def print_errors(errors: "ErrorAccount") -> None:
+    """Where the error is, a table for each question."""
+    from compgs.evaluation.error_sheet import distance_in_words, scale_in_words
+
+    def db(psnr: float | None) -> str:
+        return "" if psnr is None else f"{psnr:.2f} dB"
+
+    def share(part: "Part | ScalePart") -> str:
+        return f"{100 * part.share:.1f} %"
+
+    say("Where the squared error is, by region of the picture:")
+    table = Table(box=None, pad_edge=False, show_header=False)
+    for row in errors.regions:
+        table.add_row(*map(share, row))
+    console.print(table)
+    _print_parts(("scale", "of the error"), [(scale_in_words(p.finer_than), share(p)) for p in errors.scales])
+    _print_parts(
+        ("distance, world units", "of the error", "of the pixels", "PSNR"),
+        [
+            (distance_in_words(p.near, p.far), share(p), f"{100 * p.pixels:.1f} %", db(p.psnr))
+            for p in errors.distances
+        ],
+    )
+    _print_parts(
+        ("view, the worst", "of the error", "PSNR"),
+        [(view.name, share(view), db(view.psnr)) for view in errors.views[:WORST_VIEWS]],
+    )
+
+
+def _print_parts(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    console.print()
+    table = Table(box=None, pad_edge=False)
+    for i, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if i else "left")
+    for cells in rows:
+        table.add_row(*map(escape, cells))
+    console.print(table)
 
 
 def print_reduction(reduction: "Reduction") -> None:

@@ -14,7 +14,7 @@ from compgs.cli.command import (
     SceneOptions,
     check_measures,
 )
-from compgs.cli.console import print_results, say, warn
+from compgs.cli.console import print_errors, print_results, say, warn
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import file_and_run, read_otherwise
 from compgs.cli.scenes import read_scene
@@ -58,6 +58,10 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
     """Also measure FLIP, a perceptual measure without learned weights (needs `pip install '.[flip]'` in the project's
     folder)."""
 
+    errors: FlagCreatePairsOff[bool] = False
+    """Also say where the error is: by region of the picture, by scale, by distance and by view. With -o, FOLDER gets
+    errors.json and errors.png."""
+
     exposure: FlagCreatePairsOff[bool] = False
     """Give each rendering the exposure of its photograph, fitted to the left half, and measure the right half; as for
     runs that were trained with --set training.exposure=true."""
@@ -87,6 +91,7 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
                 overwrite=self.overwrite,
                 lpips=self.lpips_weights or self.lpips,
                 flip=self.flip,
+                errors=self.errors,
                 device=self.device,
                 method=run.method if run else None,
                 exposure=self.exposure or (run is not None and run.config.training.exposure),
@@ -94,6 +99,11 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
             )
         say("")
         print_results(results)
+        if results.errors is not None:
+            say("")
+            print_errors(results.errors)
         if self.output is not None:
             say("")
             say(f"renders beside photographs: {self.output / 'contact_sheet.png'}")
+            if results.errors is not None:
+                say(f"where the error is: {self.output / 'errors.png'}, {self.output / 'errors.json'}")

@@ -29,10 +29,10 @@ def contact_sheet(
     height = label + sum(label + left.height for left, _ in pairs) + MARGIN
     sheet = Image.new("RGB", (width, height), PAPER)
     draw = ImageDraw.Draw(sheet)
-    draw.text((MARGIN, MARGIN), _drawable(title), fill=INK, font=font)
+    draw.text((MARGIN, MARGIN), drawable(title), fill=INK, font=font)
     top = label
     for (left, right), (_, _, name, psnr) in zip(pairs, rows, strict=True):
-        draw.text((MARGIN, top + MARGIN), _drawable(f"{name}: {truth}"), fill=INK, font=font)
+        draw.text((MARGIN, top + MARGIN), drawable(f"{name}: {truth}"), fill=INK, font=font)
         draw.text(
             (column + 2 * MARGIN, top + MARGIN), f"decoded file, PSNR {psnr:.2f} dB", fill=INK, font=font
         )
@@ -52,7 +52,7 @@ def striped(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     return np.where(mask[:, :, None], image, image // 2 + stripes[:, :, None])
 
 
-def _drawable(text: str) -> str:
+def drawable(text: str) -> str:
     """Names of files need not be text; what is drawn must be."""
     return text.encode("utf-8", "replace").decode()
 

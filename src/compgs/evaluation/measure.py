@@ -16,6 +16,8 @@ from compgs.devices import chosen_device, device_name
 from compgs.errors import SceneError
 from compgs.evaluation.camera_path import camera_entry
 from compgs.evaluation.contact_sheet import contact_sheet, striped
+from compgs.evaluation.error_account import ErrorSums
+from compgs.evaluation.error_sheet import error_sheet
 from compgs.evaluation.exposure import DESCRIPTION, exposed_by_left_half, right_half
 from compgs.evaluation.fit import misfits
 from compgs.evaluation.results import Results, ViewResult
@@ -23,6 +25,7 @@ from compgs.formats import component_bytes, open_scene, scene_file, scene_name
 from compgs.numerics.compiling import working_seconds
 from compgs.outputs import check_output_folder, write_bytes, write_json
 from compgs.render import Renderable, render
+from compgs.render.depth import depth
 from compgs.scene import as_scene
 from compgs.scene.views import Scene, View
 
@@ -40,6 +43,7 @@ def evaluate(
     overwrite: bool = False,
     lpips: bool | str | Path = False,
     flip: bool = False,
+    errors: bool = False,
     device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
     method: str | None = None,
@@ -59,7 +63,8 @@ def evaluate(
 
     Pixels that a view's mask leaves out do not count. With `exposure`, for scenes that were trained with exposures of
     their views, each rendering gets that of its view first, fitted to the left half, and the right half is measured
-    (`compgs.evaluation.exposure`).
+    (`compgs.evaluation.exposure`). With `errors`, the results say where the error is
+    (`compgs.evaluation.error_account`); `errors.json` and `errors.png` are then written, too.
 
     Raises BitstreamError, SplatFileError, OutputError, SceneError if the scene holds no view out or a mask leaves
     nothing, and MissingDependency where FLIP is asked for and cannot be measured.
@@ -81,6 +86,7 @@ def evaluate(
         model, scene.test_views[0].camera
     )  # kernels are loaded and caches filled: not what a view costs
     network, lpips_note = lpips_or_why_not(lpips, chosen)
+    sums = ErrorSums() if errors else None
     rows: list[ViewResult] = []
     images: list[np.ndarray] = []
     for i, view in enumerate(scene.test_views):
@@ -106,6 +112,9 @@ def evaluate(
                 flip=metrics.flip(seen, photograph, mask) if flip else None,
             )
         )
+        if sums is not None:
+            distance = depth(model, view.camera)
+            sums.add(view.name, seen, photograph, mask, right_half(distance) if exposure else distance)
         images.append(image)
         if progress:
             progress(i + 1, len(scene.test_views))
@@ -130,6 +139,7 @@ def evaluate(
         exposure=DESCRIPTION if exposure else None,
         per_view=tuple(rows),
         notes=misfits(model.viewpoints, scene),
+        errors=None if sums is None else sums.account(),
     )
     if output is not None:
         write_evaluation(Path(output), results, scene.test_views, images, truth)
@@ -216,6 +226,10 @@ def write_evaluation(
     write_bytes(folder / "contact_sheet.png", encode_png(sheet))
     write_json(folder / "cameras.json", [camera_entry(view.camera, view.name) for view in views])
     write_json(folder / "per_view.json", results.per_view_list())
+    if results.errors is not None:
+        title = f"{results.scene}: where the error is, {results.psnr:.2f} dB, {len(views)} held-out views"
+        write_bytes(folder / "errors.png", encode_png(error_sheet(results.errors, title)))
+        write_json(folder / "errors.json", results.errors.to_dict())
     write_json(folder / "results.json", results.to_dict())
 
 

@@ -32,7 +32,10 @@
 import dataclasses
 from dataclasses import dataclass
 from statistics import fmean, median
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from compgs.evaluation.error_account import ErrorAccount
 
 SCHEMA = "compgs results 1"
 
@@ -75,6 +78,7 @@ class Results:
     per_view: tuple[ViewResult, ...]
     exposure: str | None = None  # how renderings got that of their photographs; None: they did not
     notes: tuple[str, ...] = ()  # in what the scene is not what the file was trained on (`evaluation/fit.py`)
+    errors: "ErrorAccount | None" = None  # where the error is, if that was asked for; written to errors.json
 
     @property
     def psnr(self) -> float:
