@@ -30,10 +30,12 @@ from compgs.tensors.scenes import HybridOnDevice
 ROOT = Path(__file__).parent.parent
 GOLDEN = ROOT / "tests" / "golden"
 sys.path += [str(ROOT / "tools"), str(ROOT / "benchmarks")]
-from make_golden_files import TRAINED  # noqa: E402
+from make_golden_files import FOREIGN, TRAINED  # noqa: E402
 from plain_prediction import CUTOFF, Content, Primitive, is_drawn, primitives  # noqa: E402
 
 FIELDS = ("mean", "scales", "quaternion", "opacity", "color")
+# Their networks' numbers are beyond what the tolerance holds for; a sum over `long` is slow here and says nothing new.
+UNLIKELY = (*FOREIGN, "long")
 SHOWN = 8  # Gaussians that are written in full
 # No opacity may be so near to the threshold that another implementation counts otherwise.
 MARGIN = 5e-4
@@ -114,6 +116,8 @@ def main() -> None:
     names = sorted(json.loads((GOLDEN / "hashes.json").read_text(encoding="utf-8")))
     pinned = {}
     for name in names:
+        if name in UNLIKELY:
+            continue
         content = plain_content(*read_latents((GOLDEN / f"{name}.cgs").read_bytes()))
         pinned[name] = golden_gaussians(content)
         print(f"{name}: {pinned[name]['count']} Gaussians from {pinned[name]['camera_center']}")

@@ -18,7 +18,7 @@ from compgs.errors import BitstreamError, CorruptSection
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 import fuzz
-from fuzz import FORGERS, GOLDEN, forgeries, outcome
+from fuzz import FORGERS, forgeries, golden_paths, outcome
 from made_content import make_content
 
 MEMORY_FLOOR = 48 << 20  # what any file may take, for its 2^20 free symbols
@@ -27,7 +27,7 @@ MEMORY_PER_BYTE = 4096
 
 @pytest.fixture(scope="module")
 def golden() -> list[bytes]:
-    return [path.read_bytes() for path in sorted(GOLDEN.glob("*.cgs"))]
+    return [path.read_bytes() for path in golden_paths()]
 
 
 def test_forgeries_are_refused_or_sound(golden: list[bytes]) -> None:

@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { compgs, fixtures, goldenFiles, hashesOf, refusedFiles } from "./fixtures.mjs";
+import { compgs, fixtures, goldenFiles, goldenPrefixes, hashesOf, refusedFiles } from "./fixtures.mjs";
 
 const { decode, plainKernels, wasmKernels } = compgs;
 const KINDS = { "plain TypeScript": plainKernels, WebAssembly: await wasmKernels() };
@@ -11,6 +11,12 @@ for (const [kind, kernels] of Object.entries(KINDS)) {
   for (const { name, bytes, hashes } of goldenFiles()) {
     test(`${kind}: golden file ${name} decodes to its pinned integers`, () => {
       assert.deepEqual(hashesOf(decode(bytes, { kernels })), hashes);
+    });
+  }
+
+  for (const { name, bytes, hashes } of goldenPrefixes()) {
+    test(`${kind}: the beginning of golden file ${name} decodes to its pinned integers`, () => {
+      assert.deepEqual(hashesOf(decode(bytes, { kernels, prefix: true })), hashes);
     });
   }
 

@@ -15,6 +15,21 @@ export const FIXTURES = process.env.CGS_FIXTURES ?? "";
 const VERSIONS = [2, 3, 4, 5];
 const ROLES = ["side", "reference", "log scales", "residual"];
 
+/** Networks of the prediction heads, and how many blocks each has. */
+const HEADS = {
+  separate: [
+    ["translation", 1],
+    ["covariance", 1],
+    ["opacity", 1],
+    ["color", 2],
+  ],
+  paired: [
+    ["geometry", 1],
+    ["appearance", 1],
+  ],
+};
+const OUTER = ["input_weight", "input_bias", "output_weight", "output_bias", "skip_weight"];
+
 /** [name, bytes, hashes] of the golden files of the versions that are read. */
 export function goldenFiles() {
   const pinned = JSON.parse(readFileSync(join(GOLDEN, "hashes.json"), "utf8"));
@@ -24,6 +39,19 @@ export function goldenFiles() {
       return { name, bytes: readFileSync(join(GOLDEN, `${name}.cgs`)), hashes: arrays };
     })
     .filter(({ bytes }) => VERSIONS.includes(bytes[4]));
+}
+
+/** {name, bytes, hashes} of beginnings of golden files. */
+export function goldenPrefixes() {
+  const pinned = JSON.parse(readFileSync(join(GOLDEN, "prefixes.json"), "utf8"));
+  return Object.entries(pinned).flatMap(([name, sizes]) => {
+    const file = readFileSync(join(GOLDEN, `${name}.cgs`));
+    return Object.entries(sizes).map(([size, hashes]) => ({
+      name: `${name}, ${size} bytes`,
+      bytes: file.subarray(0, Number(size)),
+      hashes,
+    }));
+  });
 }
 
 /** [name, bytes, pinned] of what a camera sees of the golden files. */
@@ -58,13 +86,29 @@ export function refusedFiles() {
 
 /** SHA-256 of each array, under the names of tests/golden/hashes.json. */
 export function hashesOf(scene) {
-  const hashes = { coordinates: sha256(scene.coordinates), mask: sha256(scene.mask) };
+  const hashes = {
+    coordinates: sha256(scene.coordinates),
+    mask: sha256(scene.mask),
+    heads: sha256(headIntegers(scene)),
+  };
   scene.groups.forEach((group, i) => {
     const name = `group ${i}, ${ROLES[group.role]}`;
     hashes[`${name}: symbols`] = sha256(group.role === 3 ? scattered(scene, group) : group.symbols);
     hashes[`${name}: latents`] = sha256(group.latents);
   });
   return hashes;
+}
+
+/** The exponent and the integers of each tensor, in the order of version 5. */
+function headIntegers({ heads, tensors }) {
+  const names = HEADS[heads].flatMap(([network, blocks]) => {
+    const inner = Array.from({ length: blocks }, (_, b) =>
+      ["weight1", "bias1", "weight2", "bias2"].map((tensor) => `blocks.${b}.${tensor}`),
+    ).flat();
+    return [...OUTER, ...inner].map((tensor) => `${network}.${tensor}`);
+  });
+  const stored = [...names, "residuals"].flatMap((name) => tensors.get(name) ?? []);
+  return Int32Array.from(stored.flatMap(({ exponent, values }) => [exponent, ...values]));
 }
 
 function sha256(array) {

@@ -133,7 +133,10 @@ def _with_heads(content: FileContent) -> FileContent:
 
 
 def hashes(content: FileContent, latents: Latents) -> dict[str, str]:
-    arrays = {"coordinates": content.coordinates, "mask": content.mask}
+    stored = dict(content.heads)
+    tensors = [stored[name] for name in content.dimensions.head_shapes]
+    heads = np.concatenate([np.append(tensor.exponent, tensor.values) for tensor in tensors])
+    arrays = {"coordinates": content.coordinates, "mask": content.mask, "heads": heads}
     for i, (group, values) in enumerate(zip(content.groups, latents, strict=True)):
         name = f"group {i}, {group.shape.role.name.lower().replace('_', ' ')}"
         arrays |= {f"{name}: symbols": group.symbols, f"{name}: latents": values}
