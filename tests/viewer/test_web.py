@@ -5,6 +5,8 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
+
 import compgs
 
 from .conftest import WEB, run
@@ -33,3 +35,12 @@ def test_the_lock_file_names_no_host() -> None:
     lock = json.loads((WEB / "package-lock.json").read_text(encoding="utf-8"))
     assert not any("resolved" in package for package in lock["packages"].values())
     assert all("integrity" in package for name, package in lock["packages"].items() if name)
+
+
+@pytest.mark.parametrize("kernels", ["wasm", "plain"])
+def test_the_decoder_for_the_web_conforms(node: str, built: Path, kernels: str) -> None:
+    """It draws with a browser's help alone, so that pictures are not asked for."""
+    judge = WEB.parent / "conformance"
+    command = [node, str(judge / "decoders" / "web.mjs"), kernels]
+    output = run([sys.executable, str(judge / "run.py"), *command], CGS_BUILD=str(built))
+    assert output.endswith("conforms\n")

@@ -6,6 +6,7 @@ const MAX_COMPONENT = 16383;
 const COMPONENT_UNIT = MAX_COMPONENT * Math.SQRT2;
 /** Of three stored components: 3/4 and what their rounding adds. Beyond it the fourth would not be the largest. */
 const MAX_SQUARES = 3 * 2 ** 27;
+const UP_UNIT = 127;
 const POSITION_UNIT = 32767;
 
 export interface Viewpoint {
@@ -43,6 +44,7 @@ export function readViewpoints(payload: Uint8Array, name: string): Viewpoints {
   const up: [number, number, number] = [reader.i8("up"), reader.i8("up"), reader.i8("up")];
   const norm = Math.hypot(...up);
   if (norm === 0) reader.refuse("up has no direction");
+  if (Math.min(...up) < -UP_UNIT) reader.refuse(`up is ${up}, expected ${-UP_UNIT} or more`);
   const centre: [number, number, number] = [coordinate(), coordinate(), coordinate()];
   const radius = length("radius", reader.f32("radius"));
   const lensCount = reader.u8("lenses");
@@ -57,7 +59,11 @@ export function readViewpoints(payload: Uint8Array, name: string): Viewpoints {
   const views = Array.from({ length: viewCount }, () => {
     const lens = lenses[reader.u8("lens")];
     if (!lens) return reader.refuse("a view has a lens that is not there");
-    const along = (axis: number): number => centre[axis]! + (radius * reader.i16("position")) / POSITION_UNIT;
+    const along = (axis: number): number => {
+      const place = reader.i16("position");
+      if (place < -POSITION_UNIT) reader.refuse(`a position is ${place}, expected ${-POSITION_UNIT} or more`);
+      return centre[axis]! + (radius * place) / POSITION_UNIT;
+    };
     const position: [number, number, number] = [along(0), along(1), along(2)];
     return { ...lens, position, rotation: readRotation(reader) };
   });
