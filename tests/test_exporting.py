@@ -20,7 +20,7 @@ from compgs.formats import encoded, open_scene, read_ply
 from compgs.formats.arrays import normalized
 from compgs.formats.ply import ply_size
 from compgs.model.splats import SplatArrays, SplatModel
-from compgs.render import RasterSettings
+from compgs.render import RasterSettings, render
 
 
 @pytest.fixture(autouse=True)
@@ -60,6 +60,34 @@ def test_splats_that_nothing_is_asked_of_keep_their_numbers(
 def test_the_loss_of_quantization_is_measured_on_the_written_file(ply: Path, tmp_path: Path) -> None:
     done = export(ply, tmp_path / "b.spz")
     assert 25 < done.worst < done.mean < 90
+
+
+@pytest.mark.parametrize("kind", ["ply", "spz", "sog"])
+def test_antialiased_splats_stay_so(
+    tmp_path: Path, kind: str, random_splats: Callable[..., SplatArrays]
+) -> None:
+    """Thin ones, of which plain dilation makes pictures of another brightness."""
+    thin = replace(random_splats(), log_scales=np.full((60, 3), -7, np.float32), antialiased=True)
+    source, out = tmp_path / "a.ply", tmp_path / f"b.{kind}"
+    source.write_bytes(encoded(thin, "ply"))
+    done = export(source, out)
+    assert open_scene(out).antialiased and done.worst > 45
+    plain = tmp_path / "plain.ply"
+    plain.write_bytes(encoded(replace(thin, antialiased=False), "ply"))
+    camera = own_cameras(open_scene(plain))[0]
+    dim, bright = (render(open_scene(file), camera).image.sum() for file in (source, plain))
+    assert 0 < dim < bright / 2
+
+
+def test_a_file_that_cannot_say_that_splats_are_antialiased_is_told_of(
+    tmp_path: Path, random_splats: Callable[..., SplatArrays], caplog: pytest.LogCaptureFixture
+) -> None:
+    source = tmp_path / "a.ply"
+    thin = replace(random_splats(), log_scales=np.full((60, 3), -6, np.float32), antialiased=True)
+    source.write_bytes(encoded(thin, "ply"))
+    done = export(source, tmp_path / "b.glb")
+    assert done.worst < 60  # the loss that a program sees that opens it
+    assert f"{tmp_path / 'b.glb'}: its splats are antialiased" in caplog.text
 
 
 def test_harmonics_above_the_degree_are_left_out_and_the_rest_is_fitted(ply: Path, tmp_path: Path) -> None:

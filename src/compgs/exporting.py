@@ -21,7 +21,7 @@ from compgs.devices import chosen_device
 from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError, SplatFileError
 from compgs.evaluation.camera_path import between, surround
 from compgs.evaluation.importance import splat_importance
-from compgs.formats import WRITERS, SplatArrays, format_of, open_scene, scene_file, spz
+from compgs.formats import WRITERS, SplatArrays, format_of, open_scene, scene_file, spz, told
 from compgs.formats.baking import Baked, bake
 from compgs.formats.refining import refine as refine_splats
 from compgs.formats.registry import KEEP_WORLD_OFFSET
@@ -29,6 +29,7 @@ from compgs.formats.tiled_scene import TiledScene
 from compgs.model.degrees import MAX_DEGREE
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
+from compgs.notes import note
 from compgs.outputs import check_output_file, write_bytes
 from compgs.render import RasterSettings, Renderable, render, settings_of
 from compgs.render.settings import DEFAULT_SETTINGS, as_angle
@@ -141,10 +142,13 @@ def export(
     else:
         baked, dropped = _splats_of(model, (), MAX_DEGREE, count), 0
     data = written(baked)
-    psnr = tuple(_compared(model, _read_back(data, kind, model, chosen), compared, count))
+    if text := told(baked.splats, kind):
+        note(path, text)
+    again = _read_back(data, kind, model, chosen)
+    psnr = tuple(_compared(model, again, compared, count))
     write_bytes(path, data)
     sharp = settings_of(model).dilation_of(cameras[0]) < SOFTER * settings.dilation_of(cameras[0])
-    return Exported(len(data), len(baked.importance), baked.splats.degree, dropped, psnr, origin, sharp)
+    return Exported(len(data), again.counts["splats"], baked.splats.degree, dropped, psnr, origin, sharp)
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,16 @@
 """`compgs export`: what is said, and which mistakes are caught before anything is computed."""
 
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from compgs.cli.export import report
 from compgs.cli.main import main
 from compgs.exporting import Exported
-from compgs.formats import open_scene
+from compgs.formats import encoded, open_scene
+from compgs.model.splats import SplatArrays
 
 ORIGIN = (0.0, 0.0, 0.0)
 
@@ -135,3 +138,17 @@ def test_a_report_of_equal_pictures_and_of_a_page() -> None:
     assert report(Path("a.cgs"), Path("b.html"), page) == [
         "b.html: 1.0 kB, a page that shows a.cgs without anything else"
     ]
+
+
+def test_what_is_left_out_of_a_file_of_splats_is_said_once(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, random_splats: Callable[..., SplatArrays]
+) -> None:
+    splats = random_splats()
+    splats.means[3, 1] = np.nan
+    source, out = tmp_path / "a.ply", tmp_path / "b.ply"
+    source.write_bytes(encoded(splats, "ply"))
+    code, said, err = outcome(capsys, "export", source, out)
+    assert (code, err) == (0, "")
+    lines = [line for line in said.splitlines() if line.startswith("note: ")]
+    assert len(lines) == 1 and lines[0].startswith(f"note: {source}: 1 of 60 splats were left out")
+    assert "59 splats" in said

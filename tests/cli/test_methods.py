@@ -81,5 +81,6 @@ def test_a_damaged_ply_is_refused_before_anything_is_read_or_made(
     file = tmp_path / "scene.ply"
     file.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n1 2 3\n")
     assert main([command, str(file), str(tmp_path / "no scene"), "-o", str(tmp_path / "out")]) == 1
-    assert capsys.readouterr().err.startswith(f"error: {file}: expected 'format binary_little_endian 1.0'")
+    expected = f"error: {file}: property 'x' is missing: these are points, not splats"
+    assert capsys.readouterr().err.startswith(expected)
     assert not (tmp_path / "out").exists()

@@ -370,3 +370,9 @@ def test_what_would_change_the_picture_is_refused(
     path.write_bytes(edited(lambda g: change(g) and None)(glb.encoded(made(4))))
     with pytest.raises(SplatFileError, match=message):
         glb.read(path)
+
+
+def test_that_antialiased_splats_lose_that_is_told(made) -> None:
+    assert glb.told(made(2)) is None
+    said = glb.told(replace(made(2), antialiased=True))
+    assert said is not None and "which .glb has no place for" in said

@@ -131,6 +131,48 @@ def test_positions_beyond_24_bits_are_refused_and_far_ones_get_fewer_digits(made
         spz.encoded(replace(arrays, means=arrays.means * 1e8))
 
 
+def small(made, count: int = 500) -> SplatArrays:
+    """Splats of a hundredth of a unit, within some units."""
+    return replace(made(count, 0), log_scales=np.full((count, 3), np.log(0.01), np.float32))
+
+
+def at_distance(arrays: SplatArrays, row: int, distance: float, scale: float = 0.01) -> SplatArrays:
+    means, scales = arrays.means.copy(), arrays.log_scales.copy()
+    means[row, 1], scales[row] = -distance, np.log(scale)
+    return replace(arrays, means=means, log_scales=scales)
+
+
+@pytest.mark.parametrize("distance", [1e5, 1e30])
+def test_one_far_splat_does_not_cost_the_others_their_digits(made, tmp_path: Path, distance: float) -> None:
+    arrays, path = small(made), tmp_path / "a.spz"
+    path.write_bytes(spz.encoded(at_distance(arrays, 7, distance)))
+    again = spz.read(path)
+    np.testing.assert_allclose(again.means, np.delete(arrays.means, 7, axis=0), atol=0.01 / 16)
+    said = spz.told(at_distance(arrays, 7, distance))
+    assert said is not None and said.startswith(f"without 1 of 500 splats: up to {distance:g} world")
+    assert spz.told(arrays) is None
+
+
+def test_what_is_far_and_seen_stays_and_what_that_costs_is_told(made, tmp_path: Path) -> None:
+    """A sky of large splats, and many far ones, are no floaters."""
+    path = tmp_path / "a.spz"
+    sky = at_distance(small(made), 7, 1e5, scale=1e4)
+    many = small(made)
+    for row in range(10):
+        many = at_distance(many, row, 1e5)
+    for arrays in (sky, many):
+        path.write_bytes(spz.encoded(arrays))
+        assert len(spz.read(path)) == 500
+        said = spz.told(arrays)
+        assert said is not None and "steps of 0.015625 world units, 1.6 times the size of a splat" in said
+
+
+def test_splats_a_little_far_stay_without_a_word(made) -> None:
+    """A bit less than wanted is no loss to see: 524 288 sizes of a splat use all 24."""
+    arrays = at_distance(small(made), 7, 6000.0)
+    assert spz.without_floaters(arrays) is arrays and spz.told(arrays) is None
+
+
 def test_version_4_without_zstandard_names_the_remedy(made, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "zstandard", None)
     with pytest.raises(MissingDependency, match=r"pip install '\.\[spz\]'.*version 3 needs nothing"):

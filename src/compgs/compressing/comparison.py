@@ -9,7 +9,7 @@ from statistics import fmean
 from compgs import metrics
 from compgs.devices import CPU
 from compgs.errors import SplatFileError
-from compgs.formats import encoded, open_scene
+from compgs.formats import encoded, open_scene, told
 from compgs.model.splats import ORIGIN, SplatModel
 from compgs.render import Renderable, render
 from compgs.scene.views import View
@@ -42,11 +42,14 @@ def compare(
     rows, notes = [], []
     with tempfile.TemporaryDirectory() as folder:
         for name in formats:
+            splats = model.at(ORIGIN).splats
             try:
-                data = encoded(model.at(ORIGIN).splats, name)
+                data = encoded(splats, name)
             except SplatFileError as error:  # what one of them cannot hold, ours may
                 notes.append(f"the same splats as .{name}: {str(error).partition(';')[0]}")
                 continue
+            if text := told(splats, name):
+                notes.append(f"the same splats as .{name}: {text}")
             file = Path(folder, f"same.{name}")
             file.write_bytes(data)
             again = open_scene(file, device, model.background)

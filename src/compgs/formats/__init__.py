@@ -25,6 +25,7 @@ from compgs.formats.registry import (
     open_scene,
     scene_file,
     scene_name,
+    told,
     writer_of,
 )
 from compgs.formats.tiled import open_tiles
@@ -43,6 +44,7 @@ __all__ = [
     "read_ply",
     "scene_file",
     "scene_name",
+    "told",
     "write_ply",
     "writer_of",
 ]

@@ -85,6 +85,16 @@ def encoded(arrays: SplatArrays) -> bytes:
     return MAGIC + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 
+def told(arrays: SplatArrays) -> str | None:
+    """What becomes of splats that a file cannot hold as they are, in words."""
+    if not arrays.antialiased:
+        return None
+    return (
+        "its splats are antialiased, which .glb has no place for: programs that open it draw small ones too bright; "
+        ".ply, .spz and .sog say it"
+    )
+
+
 def _columns(arrays: SplatArrays) -> dict[str, np.ndarray]:
     """Attributes [M, parts] by name: float32, the color bytes; rows of all are multiples of four bytes."""
     colors = np.column_stack([COLOR_OFFSET + Y0 * arrays.dc, arrays.opacities])

@@ -87,6 +87,8 @@ WRITERS: dict[str, Callable[[SplatArrays], bytes]] = {
     "sog": sog.encoded,
     "glb": glb.encoded,
 }
+# What becomes of splats that a format cannot hold as they are, in words.
+TOLD: dict[str, Callable[[SplatArrays], str | None]] = {"spz": spz.told, "glb": glb.told}
 # Formats that say where positions count from, or whose positions are of the world.
 KEEP_WORLD_OFFSET = ("ply", "glb")
 
@@ -164,3 +166,8 @@ def encoded(arrays: SplatArrays, name: str) -> bytes:
     if not len(arrays):
         raise SplatFileError(f".{name}: there are no splats to write")
     return WRITERS[name](arrays)
+
+
+def told(arrays: SplatArrays, name: str) -> str | None:
+    """What one of `WRITERS` makes of splats that it cannot hold as they are, in words; None: nothing worth telling."""
+    return TOLD[name](arrays) if name in TOLD else None

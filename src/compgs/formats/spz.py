@@ -80,6 +80,11 @@ POSITION_LIMIT = (1 << 23) - 1  # of 24 bits with a sign
 MOST_FRACTIONAL_BITS = 24
 # Positions are as fine as this part of the median splat: farther digits are noise that costs bytes.
 STEP_OF_SCALE = 1 / 16
+# Positions may be this many bits coarser before splats are left out for them.
+SPARE_BITS = 1
+# Of all splats, one at least, that may be left out: a capture that reaches far has more of them than floaters.
+MOST_FLOATERS = 1 / 500
+FAINT = 1e-3  # of its distance from the middle: a smaller splat is a pixel at most in a picture of a thousand
 # Kept bits of 8: the others are zero, which compresses. Of a baked scene 7 and 6 are 44 dB from it; 5 and 4, which
 # other programs write, are 38 dB and three quarters of the bytes; 8 and 8 are 46 dB and 1.4 times the bytes.
 HARMONIC_BITS = (7, 6)  # of degree 1; of degrees 2 and 3
@@ -119,7 +124,7 @@ def encoded(arrays: SplatArrays, version: int = 3) -> bytes:
     """The content of a file of version 3 or 4. Raises MissingDependency (4, without a Zstandard module), SplatFileError
     for splats that lie too far from the origin for 24 bits."""
     assert version in WRITTEN_VERSIONS, version
-    arrays = turned(arrays, RIGHT_UP_BACK)
+    arrays = turned(without_floaters(arrays), RIGHT_UP_BACK)
     bits = fractional_bits(arrays)
     degree = arrays.degree
     flags = ANTIALIASED if arrays.antialiased else 0
@@ -145,16 +150,75 @@ def encoded(arrays: SplatArrays, version: int = 3) -> bytes:
 
 def fractional_bits(arrays: SplatArrays) -> int:
     """As many as the splats are fine, and as their distance from the origin leaves. Raises SplatFileError."""
-    reach = float(np.abs(arrays.means).max())
-    middle = float(np.median(np.sort(arrays.log_scales, axis=1)[:, 1]))
-    wanted = int(np.ceil(-np.log2(STEP_OF_SCALE) - middle / np.log(2)))
-    room = int(np.floor(np.log2(POSITION_LIMIT / max(reach, 1e-30))))
+    reach = _reach(arrays).max()
+    room = int(_room(reach))
     if room < 0:
         raise SplatFileError(
             f".spz: positions reach {reach:g} world units from the origin, its 24 bits at most {POSITION_LIMIT}; "
             "write .ply or .glb"
         )
-    return max(0, min(wanted, room, MOST_FRACTIONAL_BITS))
+    return max(0, min(_wanted_bits(arrays), room))
+
+
+def without_floaters(arrays: SplatArrays) -> SplatArrays:
+    """All but a few splats so far away that the others would lose their digits, and too small to be missed.
+
+    One splat 100 000 units away leaves all positions in steps of 1/64 unit: 24 bits are shared by all.
+    """
+    reach = _reach(arrays)
+    wanted, room = _wanted_bits(arrays), _room(reach)
+    if room.min() >= wanted - SPARE_BITS:
+        return arrays
+    middle = np.median(arrays.means.astype(np.float64), axis=0)
+    distances = np.linalg.norm(arrays.means - middle, axis=1)
+    faint = np.exp(arrays.log_scales.max(1).astype(np.float64)) < FAINT * distances
+    most = max(1, int(len(arrays) * MOST_FLOATERS))
+    for bits in range(wanted, int(room.min()), -1):
+        far = room < bits
+        if far.sum() <= most and faint[far].all():
+            return arrays.rows(~far)
+    return arrays
+
+
+def told(arrays: SplatArrays) -> str | None:
+    """What becomes of splats that a file cannot hold as they are, in words; None: nothing that could be seen."""
+    kept = without_floaters(arrays)
+    farthest, reach = (_reach(splats).max() for splats in (arrays, kept))
+    parts = []
+    if left_out := len(arrays) - len(kept):
+        steps = 2.0 ** -max(0, int(_room(farthest)))
+        parts.append(
+            f"without {left_out:,} of {len(arrays):,} splats: up to {farthest:g} world units from the origin, they "
+            f"would leave all positions in steps of {steps:g}"
+        )
+    if 0 <= _room(reach) < _wanted_bits(kept) - SPARE_BITS:
+        step = 2.0 ** -fractional_bits(kept)
+        parts.append(
+            f"positions are in steps of {step:g} world units, {step / _middle_scale(kept):.2g} times the size of a "
+            f"splat: they reach {reach:g} units from the origin, and have 24 bits"
+        )
+    return f"{'; '.join(parts)}; .ply and .glb keep them as they are" if parts else None
+
+
+def _reach(arrays: SplatArrays) -> np.ndarray:
+    """[M] float64, world units: of each splat along the axis on which it is farthest from the origin."""
+    return np.abs(arrays.means.astype(np.float64)).max(1)
+
+
+def _room(reach: np.ndarray) -> np.ndarray:
+    """Fractional bits that a position leaves, of the 24."""
+    return np.minimum(np.floor(np.log2(POSITION_LIMIT / np.maximum(reach, 1e-30))), MOST_FRACTIONAL_BITS)
+
+
+def _wanted_bits(arrays: SplatArrays) -> int:
+    """Fractional, for positions that are as fine as the splats."""
+    bits = int(np.ceil(-np.log2(STEP_OF_SCALE * _middle_scale(arrays))))
+    return min(bits, MOST_FRACTIONAL_BITS)
+
+
+def _middle_scale(arrays: SplatArrays) -> float:
+    """World units: the middle one of a splat's extents, of the median splat."""
+    return float(np.exp(np.median(np.sort(arrays.log_scales.astype(np.float64), axis=1)[:, 1])))
 
 
 def _packed_positions(means: np.ndarray, bits: int) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Methods by their names: settings, training, writing; what is asked for is checked before anything is computed."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,6 +9,7 @@ from compgs.config import PRESETS, Config, check_config, config_from_dict, load_
 from compgs.errors import ConfigError
 from compgs.extras import require
 from compgs.methods.method import Method
+from compgs.notes import note
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -104,6 +106,9 @@ def opened_splats(path: str | Path, scene: "Scene") -> "SplatModel":
     model = open_scene(path, background=scene.background)
     if not isinstance(model, SplatModel):
         raise ConfigError(f"{path}: expected a file of splats, found another kind of scene; export it first")
+    if model.antialiased:
+        note(Path(path), "its splats are antialiased, training goes on without: small ones begin too bright")
+        model = replace(model, splats=replace(model.splats, antialiased=False))
     return model
 
 

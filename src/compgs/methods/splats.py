@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from compgs.errors import ConfigError
 from compgs.methods.method import SPLAT_SETTINGS, Method
+from compgs.notes import note
 
 if TYPE_CHECKING:
     from compgs.config import Config
@@ -39,10 +40,13 @@ def _train_near(
 
 def _writes(suffix: str) -> "Callable[[SplatModel, Path, Config], int]":
     def write(model: "SplatModel", path: Path, config: "Config") -> int:
-        from compgs.formats import encoded
+        from compgs.formats import encoded, told
         from compgs.outputs import write_bytes
 
-        data = encoded(model.splats, suffix.removeprefix("."))
+        name = suffix.removeprefix(".")
+        data = encoded(model.splats, name)
+        if text := told(model.splats, name):
+            note(path, text)
         write_bytes(path, data)
         return len(data)
 
