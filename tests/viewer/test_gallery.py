@@ -64,6 +64,7 @@ def test_a_file_is_served_whole_and_in_parts(address: tuple[str, int]) -> None:
     path = "/files/inner/a%20b%26%3Ci%3E.cgs"
     status, headers, body = ask(address, path)
     assert (status, body, headers["Accept-Ranges"]) == (200, DATA, "bytes")
+    assert headers["Content-Type"] == "model/vnd.compgs"
     status, headers, body = ask(address, path, Range="bytes=10-19")
     assert (status, body, headers["Content-Range"]) == (206, DATA[10:20], "bytes 10-19/2048")
     assert ask(address, path, Range="bytes=2040-")[2] == DATA[2040:]

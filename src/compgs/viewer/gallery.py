@@ -13,7 +13,7 @@ from urllib.parse import quote, unquote, urlsplit
 
 from compgs.viewer.page import html_page
 
-SUFFIX = ".cgs"
+SUFFIX, MEDIA_TYPE = ".cgs", "model/vnd.compgs"  # docs/bitstream.md, "Promise"
 FILES = "/files/"
 VIEW = "/view"
 COPIED_BYTES = 1 << 20  # of a file, in memory at a time
@@ -130,7 +130,7 @@ class GalleryHandler(BaseHTTPRequestHandler):
             self.send_response(HTTPStatus.PARTIAL_CONTENT if is_part else HTTPStatus.OK)
             if is_part:
                 self.send_header("Content-Range", f"bytes {wanted.start}-{wanted.stop - 1}/{size}")
-            self.send_header("Content-Type", "application/octet-stream")
+            self.send_header("Content-Type", MEDIA_TYPE)
             self.send_header("Accept-Ranges", "bytes")
             self.send_header("Content-Length", str(len(wanted)))
             self.end_headers()
