@@ -1,6 +1,9 @@
 """Files as other programs write them, made from known numbers by their layouts alone."""
 
+import base64
+import json
 import struct
+from typing import Any
 
 import numpy as np
 
@@ -130,3 +133,18 @@ def ksplat_file(
         others = (full, len(buckets) - full) if level else (0, 0)
         headers += struct.pack("<IIIIfHxxIIIIH", count, count, *bucket, *others, degree).ljust(1024, b"\0")
     return header + headers.ljust(1024 * (len(sections) + 1), b"\0") + bodies
+
+
+def glb_parts(glb: bytes) -> tuple[dict[str, Any], bytes]:
+    """The JSON of a .glb file, and its columns."""
+    length = struct.unpack_from("<I", glb, 12)[0]
+    return json.loads(glb[20 : 20 + length]), glb[28 + length :]
+
+
+def gltf_file(glb: bytes, uri: str | None = None) -> bytes:
+    """The same as text: columns in a file of that name, or within."""
+    gltf, data = glb_parts(glb)
+    gltf["buffers"][0]["uri"] = (
+        uri or "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    )
+    return json.dumps(gltf, indent=2).encode()

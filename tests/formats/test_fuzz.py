@@ -8,6 +8,7 @@ import pytest
 from compgs.errors import CompGSError
 from compgs.formats import FORMATS, SplatArrays, encoded, ply_compressed, ply_text
 from compgs.formats import glb as glb_format
+from compgs.formats import gltf as gltf_format
 from compgs.formats import ksplat as ksplat_format
 from compgs.formats import ply as ply_format
 from compgs.formats import sog as sog_format
@@ -15,7 +16,7 @@ from compgs.formats import splat as splat_format
 from compgs.formats import spz as spz_format
 from compgs.formats.arrays import drawable
 
-from .foreign import CompressedPly, ksplat_file, text_ply
+from .foreign import CompressedPly, gltf_file, ksplat_file, text_ply
 
 READERS = {
     "ply": ply_format,
@@ -27,6 +28,7 @@ READERS = {
     "text": ply_text,
     "compressed": ply_compressed,
     "ksplat": ksplat_format,
+    "gltf": gltf_format,
 }
 ROUNDS = 250
 
@@ -39,6 +41,8 @@ def whole(made, name: str) -> bytes:
         return text_ply(encoded(made(9, 1), "ply"))
     if name == "compressed":
         return CompressedPly(300, 1).content()
+    if name == "gltf":
+        return gltf_file(encoded(made(9, 1), "glb"))
     if name == "ksplat":
         return ksplat_file(1)
     if name == "spz4":

@@ -21,7 +21,7 @@ from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
 from compgs.render import Renderable
 
-from .foreign import ksplat_file
+from .foreign import gltf_file, ksplat_file
 
 SPLAT = np.array([0, 0, 1, 0.1, 0.1, 0.1], "<f4").tobytes() + bytes([200, 100, 50, 255, 255, 128, 128, 128])
 
@@ -29,7 +29,13 @@ SPLAT = np.array([0, 0, 1, 0.1, 0.1, 0.1], "<f4").tobytes() + bytes([200, 100, 5
 @pytest.fixture
 def contents(made, cgs_bytes: bytes) -> dict[str, bytes]:
     written = {name: encoded(made(20, 1), name) for name in WRITERS}
-    return {**written, "cgs": cgs_bytes, "splat": SPLAT * 3, "ksplat": ksplat_file(2)}
+    return {
+        **written,
+        "cgs": cgs_bytes,
+        "splat": SPLAT * 3,
+        "ksplat": ksplat_file(2),
+        "gltf": gltf_file(written["glb"]),
+    }
 
 
 def test_every_format_is_known_by_its_content_alone(contents: dict[str, bytes], tmp_path: Path) -> None:

@@ -185,7 +185,8 @@ def file_with(name: str, content: bytes) -> Callable[[Files], None]:
         (file_with("meta.json", b"[" * 100_000), "not JSON"),
         (meta_with(lambda m: []), "does not describe splats"),
         (meta_with(lambda m: m.update(version=3)), "version 3 of SOG"),
-        (meta_with(lambda m: m.pop("version")), "version None of SOG"),
+        (meta_with(lambda m: m.update(version=None)), "version None of SOG"),
+        (meta_with(lambda m: m.pop("version")), "means.shape is None"),
         (meta_with(lambda m: m.update(count="many")), "count is 'many'"),
         (meta_with(lambda m: m.update(count=-1)), "count is -1"),
         (meta_with(lambda m: m.update(count=0)), "holds no splats"),
@@ -200,7 +201,7 @@ def file_with(name: str, content: bytes) -> Callable[[Files], None]:
             meta_with(lambda m: m["scales"].update(codebook=[1e300] * 256)),
             "2 of 2 splats cannot be drawn: 2 without a size",
         ),
-        (meta_with(lambda m: m["scales"].update(codebook=["a"] * 256)), "expected 256 numbers"),
+        (meta_with(lambda m: m["scales"].update(codebook=["a"] * 256)), "expected numbers, found 'a'"),
         (
             meta_with(lambda m: m["scales"].update(codebook=[99] * 256)),
             "2 of 2 splats cannot be drawn: 2 without a size",

@@ -165,11 +165,12 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class GlbFile:
-    """A file's two chunks, and where in the JSON the splats are."""
+    """JSON and columns of a file, and where in them the splats are."""
 
     place: Path
     gltf: dict[str, Any]
     data: memoryview  # the BIN chunk
+    bytes: int  # of the whole file
     primitives: tuple[dict[str, int], ...]  # accessors by attribute, of those with splats
     placements: tuple[Placement, ...]  # one at least
     passed_over: tuple[str, ...]  # what the file says or shows, and nothing here uses
@@ -187,7 +188,12 @@ def check(path: Path) -> None:
 
 def read(path: Path) -> SplatArrays:
     """Raises SplatFileError."""
-    file = _open(path)
+    return splats_of(_open(path))
+
+
+def splats_of(file: GlbFile) -> SplatArrays:
+    """All splats of a file, at the places that its nodes give them. Raises SplatFileError."""
+    path = file.place
     splats = [_splats(file, attributes) for attributes in file.primitives]
     with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is left out in the end
         parts = [_placed(path, splats[each.primitive], each.matrix) for each in file.placements]
@@ -213,7 +219,11 @@ def _splats(file: GlbFile, attributes: dict[str, int]) -> SplatArrays:
 
 def component_bytes(path: Path) -> dict[str, int]:
     """Bytes of each component of a file; they sum to its size."""
-    file = _open(path)
+    return component_bytes_of(_open(path))
+
+
+def component_bytes_of(file: GlbFile) -> dict[str, int]:
+    """Bytes of each component; they sum to `file.bytes`."""
     labels = {"POSITION": "positions", "ROTATION": "rotations", "SCALE": "scales", "OPACITY": "opacities"}
     sizes: dict[str, int] = {}
     for attributes in file.primitives:
@@ -224,11 +234,11 @@ def component_bytes(path: Path) -> dict[str, int]:
             label = labels.get(last, label)
             dtype, parts, count = _layout(file, attributes, name)[:3]
             sizes[label] = sizes.get(label, 0) + dtype.itemsize * parts * count
-    return {"header": path.stat().st_size - sum(sizes.values()), **sizes}
+    return {"header": file.bytes - sum(sizes.values()), **sizes}
 
 
 def _open(path: Path) -> GlbFile:
-    """Chunks and structure, checked; of the attributes, that they lie within the file."""
+    """Chunks and structure, checked."""
     content = path.read_bytes()
     if len(content) < 20 or not begins(content):
         raise SplatFileError(f"{path}: does not begin as a .glb file does, or ends within its header")
@@ -248,11 +258,16 @@ def _open(path: Path) -> GlbFile:
         if kind != BIN_CHUNK or 28 + text_size + length > len(content):
             raise SplatFileError(f"{path}: its second chunk is not whole; copy it again")
         data = memoryview(content)[28 + text_size : 28 + text_size + length]
+    return described(path, gltf, data, len(content))
+
+
+def described(path: Path, gltf: dict[str, Any], data: memoryview, size: int) -> GlbFile:
+    """The structure of a file of `size` bytes, checked; of the attributes, that they lie within `data`."""
     try:
         primitives, placements = _find_splats(path, gltf)
-        file = GlbFile(path, gltf, data, primitives, placements, _passed_over(gltf))
+        file = GlbFile(path, gltf, data, size, primitives, placements, _passed_over(gltf))
         counts = [_checked_count(file, attributes) for attributes in primitives]
-        check_count(path, sum(counts[each.primitive] for each in placements), len(content))
+        check_count(path, sum(counts[each.primitive] for each in placements), size)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise SplatFileError(
             f"{path}: its JSON does not describe splats ({type(error).__name__}: {error})"

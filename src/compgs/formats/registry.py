@@ -3,11 +3,25 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from compgs.devices import placed
-from compgs.errors import NotACompGSFile, OutputError, SplatFileError
-from compgs.formats import cgs, glb, ksplat, packed, ply, ply_compressed, ply_text, sog, splat, spz, tiled
+from compgs.errors import ConfigError, NotACompGSFile, OutputError, SplatFileError
+from compgs.formats import (
+    cgs,
+    glb,
+    gltf,
+    ksplat,
+    packed,
+    ply,
+    ply_compressed,
+    ply_text,
+    sog,
+    sog_streamed,
+    splat,
+    spz,
+    tiled,
+)
 from compgs.formats.arrays import SplatArrays
 from compgs.model.splats import SplatModel
 
@@ -30,13 +44,23 @@ class Format:
     open: "Callable[[Path, Device, Background], Renderable]"
 
 
-def _opens_splats(
-    read: Callable[[Path], SplatArrays],
-) -> "Callable[[Path, Device, Background], Renderable]":
-    def open_splats(path: Path, device: "Device", background: Background) -> "Renderable":
-        return placed(SplatModel(read(path), background), device)
+class SplatReader(Protocol):
+    """What a module of a format of splats has."""
 
-    return open_splats
+    def begins(self, head: bytes, /) -> bool: ...
+
+    def check(self, path: Path, /) -> None: ...
+
+    def component_bytes(self, path: Path, /) -> dict[str, int]: ...
+
+    def read(self, path: Path, /) -> SplatArrays: ...
+
+
+def _of_splats(name: str, module: SplatReader) -> Format:
+    def open_splats(path: Path, device: "Device", background: Background) -> "Renderable":
+        return placed(SplatModel(module.read(path), background), device)
+
+    return Format(name, module.begins, module.check, module.component_bytes, open_splats)
 
 
 def _open_cgs(path: Path, device: "Device", background: Background) -> "Renderable":
@@ -58,26 +82,24 @@ def _open_tiles(path: Path, device: "Device", background: Background) -> "Render
     return tiled.open_tiles(path, device)
 
 
-# In the order in which they are asked: .ply of text before the binary one, tiles before .sog, as both may be JSON;
-# .splat, which nothing marks, comes last.
+STREAMED = _of_splats("sog", sog_streamed)
+
+# In the order in which they are asked: .ply of text and of chunks before the plain one; the meta.json of .sog, which
+# nothing marks, after all other JSON, and .splat, which nothing marks either, at the end.
 FORMATS = (
     Format("cgs", cgs.begins, cgs.check, cgs.component_bytes, _open_cgs),
-    Format("ply", ply_text.begins, ply_text.check, ply_text.component_bytes, _opens_splats(ply_text.read)),
-    Format(
-        "ply",
-        ply_compressed.begins,
-        ply_compressed.check,
-        ply_compressed.component_bytes,
-        _opens_splats(ply_compressed.read),
-    ),
-    Format("ply", ply.begins, ply.check, ply.component_bytes, _opens_splats(ply.read)),
-    Format("spz", spz.begins, spz.check, spz.component_bytes, _opens_splats(spz.read)),
+    _of_splats("ply", ply_text),
+    _of_splats("ply", ply_compressed),
+    _of_splats("ply", ply),
+    _of_splats("spz", spz),
     Format("tiles", tiled.begins, tiled.check, tiled.component_bytes, _open_tiles),
-    Format("sog", sog.begins, sog.check, sog.component_bytes, _opens_splats(sog.read)),
-    Format("glb", glb.begins, glb.check, glb.component_bytes, _opens_splats(glb.read)),
-    Format("ksplat", ksplat.begins, ksplat.check, ksplat.component_bytes, _opens_splats(ksplat.read)),
+    STREAMED,
+    _of_splats("gltf", gltf),
+    _of_splats("sog", sog),
+    _of_splats("glb", glb),
+    _of_splats("ksplat", ksplat),
     Format("packed", packed.begins, packed.check, packed.component_bytes, _open_packed),
-    Format("splat", splat.begins, splat.check, splat.component_bytes, _opens_splats(splat.read)),
+    _of_splats("splat", splat),
 )
 
 # Content of a file of splats, by what the name ends in. `spz` is version 3, which needs nothing to be installed.
@@ -141,10 +163,19 @@ def open_scene(
         0.0,
         0.0,
     ),  # RGB, 0 to 1, where the file does not know its own: all but .cgs and tiles
+    level: int | None = None,  # of a streamed .sog, 0 is the finest and the default
 ) -> "Renderable":
-    """A scene that can be rendered, of any format. Raises BitstreamError, SplatFileError, MissingDependency."""
+    """A scene that can be rendered, of any format.
+
+    Raises BitstreamError, SplatFileError, MissingDependency; ConfigError for a level that is not there.
+    """
     path = scene_file(Path(path))
-    return format_of(path).open(path, device, background)
+    found = format_of(path)
+    if level is None:
+        return found.open(path, device, background)
+    if found is not STREAMED:
+        raise ConfigError(f"{path}: --level is for scenes of several levels ({sog_streamed.NAME})")
+    return placed(SplatModel(sog_streamed.read(path, level), background), device)
 
 
 def component_bytes(path: str | Path) -> dict[str, int]:

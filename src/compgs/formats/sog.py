@@ -22,8 +22,7 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,38 +30,47 @@ import numpy as np
 from PIL import Image
 
 from compgs.errors import SplatFileError
+from compgs.formats import sog_first
 from compgs.formats.arrays import (
     MAX_DEGREE,
     SplatArrays,
-    check_count,
     drawable,
     harmonics_above_dc,
     logit,
     normalized,
 )
 from compgs.formats.palette import codebook, palette
+from compgs.formats.sog_files import (
+    BOOK,
+    FIRST,
+    META,
+    MOST_ENTRIES,
+    PALETTE_ROW,
+    QUATERNION_TAG,
+    SECOND,
+    SQRT2,
+    ZIP_MAGIC,
+    SogFiles,
+    decoded,
+    entry,
+    harmonics,
+    names,
+    numbers_or_null,
+    opened,
+    pixels,
+    positions,
+    rotations,
+)
 from compgs.notes import note
 
-VERSION = 2
-META = "meta.json"
 PLAIN_MODEL, ANTIALIASED_MODEL = "default", "antialiased"  # by newer writers, in place of `antialias`
 KNOWN = {
     "version", "count", "antialias", "model", "means", "scales", "quats", "sh0", "shN",
     "asset", "extras",  # of who wrote it, and for applications: no picture depends on them
 }  # fmt: skip
-ZIP_MAGIC = b"PK\x03\x04"
-BOOK = 256  # entries of a codebook
-PALETTE_ROW = 64  # entries in a row of the palette's image
-MOST_ENTRIES = 1 << 16
-MOST_MEMBERS = 64  # files in a zip
-MOST_META_BYTES = 1 << 20
-# Images are about as large as the splats need; 16 384 pixels is the longest side of a WebP.
-SPARE_PIXELS = 1 << 16
-QUATERNION_TAG = 252
 # Of 100, what libwebp calls the quality of lossless images. 100 tries everything, in twenty times the time: it halves
 # the rotations of splats that lie alike, saves a tenth of the scales, and nothing elsewhere.
 CRUNCHED, USUAL = 100, 99
-_SQRT2 = math.sqrt(2)
 # Made at no time, so that the same splats are the same bytes.
 _NO_TIME = (1980, 1, 1, 0, 0, 0)
 
@@ -97,7 +105,7 @@ def _images(arrays: SplatArrays) -> tuple[dict[str, bytes], dict[str, Any]]:
         "sh0.webp": _image(np.column_stack([colors, opacities])),
     }
     meta: dict[str, Any] = {
-        "version": VERSION,
+        "version": SECOND,
         "asset": {"generator": "compgs"},
         "count": len(arrays),
         "antialias": arrays.antialiased,
@@ -157,7 +165,7 @@ def _packed_rotations(quaternions: np.ndarray) -> np.ndarray:
     largest = np.abs(wxyz).argmax(1)
     wxyz *= np.where(np.take_along_axis(wxyz, largest[:, None], 1) < 0, -1, 1)
     others = wxyz[np.arange(4) != largest[:, None]].reshape(-1, 3)
-    parts = np.clip(np.rint(255 * (others / _SQRT2 + 0.5)), 0, 255)
+    parts = np.clip(np.rint(255 * (others / SQRT2 + 0.5)), 0, 255)
     return np.column_stack([parts, QUATERNION_TAG + largest]).astype(np.uint8)
 
 
@@ -180,17 +188,6 @@ def _webp(pixels: np.ndarray, effort: int = USUAL) -> bytes:
 # reading -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class SogFiles:
-    """What a zip or a folder holds, unpacked no further than to the files."""
-
-    place: Path
-    meta: dict[str, Any]
-    contents: Mapping[str, bytes]
-    bytes: int  # of everything
-    count: int  # splats
-
-
 def begins(head: bytes) -> bool:
     """Whether a file begins as a zip or as JSON does: the one is a .sog, the other may be a `meta.json`."""
     return head.startswith(ZIP_MAGIC) or head.lstrip().startswith(b"{")
@@ -198,27 +195,31 @@ def begins(head: bytes) -> bool:
 
 def check(path: Path) -> None:
     """Raises SplatFileError for what can be known without decoding an image."""
-    _files(path)
+    opened(path)
 
 
 def read(path: Path) -> SplatArrays:
     """Of a .sog file, or of a meta.json beside its images. Raises SplatFileError."""
-    files = _files(path)
-    low, high = (_pixels(files, "means", i, 3) for i in range(2))
-    colors = _pixels(files, "sh0", 0, 4)
-    scales = _pixels(files, "scales", 0, 3)
-    found = SplatArrays(
-        means=_positions(files, low.astype(np.int64) + (high.astype(np.int64) << 8)),
+    return drawable(path, splats(path))
+
+
+def splats(path: Path) -> SplatArrays:
+    """All that the file holds, also what cannot be drawn. Raises SplatFileError."""
+    files = opened(path)
+    found = sog_first.splats(files) if files.version == FIRST else _splats(files)
+    return replace(found, antialiased=_antialiased(files))
+
+
+def _splats(files: SogFiles) -> SplatArrays:
+    colors, scales = pixels(files, "sh0", 0, 4), pixels(files, "scales", 0, 3)
+    return SplatArrays(
+        means=positions(files),
         log_scales=_codebook(files, "scales")[scales],
-        quaternions=_rotations(_pixels(files, "quats", 0, 4)),
+        quaternions=rotations(files),
         opacity_logits=logit(colors[:, 3] / 255),
         dc=_codebook(files, "sh0")[colors[:, :3]],
-        rest=np.zeros((files.count, 0, 3), np.float32),
-        antialiased=_antialiased(files),
+        rest=_palette_entries(files) if "shN" in files.meta else np.zeros((files.count, 0, 3), np.float32),
     )
-    if "shN" in files.meta:
-        found = replace(found, rest=_palette_entries(files))
-    return drawable(path, found)
 
 
 def _antialiased(files: SogFiles) -> bool:
@@ -234,7 +235,7 @@ def _antialiased(files: SogFiles) -> bool:
 
 def component_bytes(path: Path) -> dict[str, int]:
     """Bytes of each component of a file; they sum to its size, of a meta.json to that of all files."""
-    files = _files(path)
+    files = opened(path)
     sizes: dict[str, int] = {}
     for name, key in {
         "means": "positions",
@@ -244,171 +245,19 @@ def component_bytes(path: Path) -> dict[str, int]:
         "shN": "harmonics",
     }.items():
         if name in files.meta:
-            sizes[key] = sum(len(files.contents[f]) for f in _names(files, name))
+            sizes[key] = sum(len(files.contents[f]) for f in names(files, name))
     return {**sizes, "container": files.bytes - sum(sizes.values())}
 
 
-def _files(path: Path) -> SogFiles:
-    """Everything but the pixels, checked."""
-    with open(path, "rb") as file:
-        zipped = file.read(4) == ZIP_MAGIC
-    contents = _zip_contents(path) if zipped else _folder_contents(path)
-    if META not in contents:
-        raise SplatFileError(f"{path}: is a zip without {META}, so not a .sog file")
-    try:
-        meta = json.loads(contents[META])
-    except (ValueError, RecursionError) as error:
-        raise SplatFileError(f"{path}: {META} is not JSON ({error}); copy it again") from error
-    if not isinstance(meta, dict) or "means" not in meta:
-        raise SplatFileError(f"{path}: {META} does not describe splats")
-    if meta.get("version") != VERSION:
-        raise SplatFileError(f"{path}: version {meta.get('version')} of SOG; expected {VERSION}")
-    count = meta.get("count")
-    if not isinstance(count, int) or isinstance(count, bool) or count < 0:
-        raise SplatFileError(f"{path}: count is {count!r}, expected a number of splats")
-    if not zipped:
-        contents |= _folder_images(path, meta)
-    size = path.stat().st_size if zipped else sum(map(len, contents.values()))
-    check_count(path, count, size)
-    files = SogFiles(path, meta, contents, size, count)
-    for name in ("means", "scales", "quats", "sh0", *(["shN"] if "shN" in meta else [])):
-        for file_name in _names(files, name):
-            if file_name not in contents:
-                raise SplatFileError(f"{path}: {file_name}, which {META} names, is missing")
-    return files
-
-
-def _zip_contents(path: Path) -> dict[str, bytes]:
-    size = path.stat().st_size
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            if len(members) > MOST_MEMBERS:
-                raise SplatFileError(f"{path}: {len(members)} files inside; expected at most {MOST_MEMBERS}")
-            contents: dict[str, bytes] = {}
-            room = size + MOST_META_BYTES  # images are compressed already; meta.json may be a little larger
-            for member in members:
-                with archive.open(member) as file:
-                    content = file.read(room + 1)
-                room -= len(content)
-                if room < 0:
-                    raise SplatFileError(f"{path}: {member.filename} is larger than the whole file may hold")
-                contents[member.filename] = content
-            return contents
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, OSError, EOFError, ValueError, RuntimeError) as error:
-        raise SplatFileError(f"{path}: is damaged ({error}); copy it again") from error
-    except Exception as error:  # zlib.error and NotImplementedError: methods that nobody writes
-        if isinstance(error, SplatFileError):
-            raise
-        raise SplatFileError(f"{path}: is damaged ({error}); copy it again") from error
-
-
-def _folder_contents(path: Path) -> dict[str, bytes]:
-    if path.stat().st_size > MOST_META_BYTES:
-        raise SplatFileError(f"{path}: expected a {META} of at most {MOST_META_BYTES} bytes")
-    return {META: path.read_bytes()}
-
-
-def _folder_images(path: Path, meta: dict[str, Any]) -> dict[str, bytes]:
-    """Of a meta.json: images beside it, and nowhere else."""
-    contents: dict[str, bytes] = {}
-    for entry in meta.values():
-        for name in entry.get("files", []) if isinstance(entry, dict) else []:
-            if not isinstance(name, str) or Path(name).name != name or len(contents) >= MOST_MEMBERS:
-                raise SplatFileError(f"{path}: {name!r} is not the name of a file beside it")
-            image = path.parent / name
-            if image.is_file():
-                contents[name] = image.read_bytes()
-    return contents
-
-
-def _entry(files: SogFiles, name: str) -> dict[str, Any]:
-    entry = files.meta.get(name)
-    if not isinstance(entry, dict):
-        raise SplatFileError(f"{files.place}: {META} has no {name}")
-    return entry
-
-
-def _names(files: SogFiles, name: str) -> list[str]:
-    found = _entry(files, name).get("files")
-    expected = 2 if name in ("means", "shN") else 1
-    if not isinstance(found, list) or len(found) != expected or not all(isinstance(f, str) for f in found):
-        raise SplatFileError(f"{files.place}: {name} names files {found!r}; expected {expected}")
-    return found
-
-
-def _numbers(files: SogFiles, name: str, key: str, count: int) -> np.ndarray:
-    """[count] float32 of meta.json, finite."""
-    values = _values(files, name, key, count)
-    if not np.isfinite(values).all():
-        raise SplatFileError(f"{files.place}: {name}.{key}: expected {count} finite numbers")
-    return values
-
-
 def _codebook(files: SogFiles, name: str) -> np.ndarray:
-    """[BOOK] float32; null, by which JSON writes what is not finite, is not-a-number."""
-    return _values(files, name, "codebook", BOOK)
-
-
-def _values(files: SogFiles, name: str, key: str, count: int) -> np.ndarray:
-    """[count] float32 of meta.json."""
-    found = _entry(files, name).get(key)
-    numbers = isinstance(found, list) and all(x is None or type(x) in (int, float) for x in found)
-    if not isinstance(found, list) or not numbers or len(found) != count:
-        raise SplatFileError(f"{files.place}: {name}.{key}: expected {count} numbers")
-    with np.errstate(over="ignore"):
-        return np.array([np.nan if x is None else x for x in found], np.float64).astype(np.float32)
-
-
-def _pixels(files: SogFiles, name: str, index: int, channels: int) -> np.ndarray:
-    """[count, channels] uint8 of one image."""
-    pixels = _decoded(files, name, index, channels, 4 * files.count + SPARE_PIXELS)
-    flat = pixels.reshape(-1, channels)
-    if len(flat) < files.count:
-        raise SplatFileError(
-            f"{files.place}: {_names(files, name)[index]} has {len(flat)} pixels for {files.count} splats"
-        )
-    return flat[: files.count]
-
-
-def _decoded(files: SogFiles, name: str, index: int, channels: int, most_pixels: int) -> np.ndarray:
-    """[H, W, channels] uint8; the size is looked at before the pixels are decoded."""
-    file_name = _names(files, name)[index]
-    place = f"{files.place}: {file_name}"
-    try:
-        with Image.open(io.BytesIO(files.contents[file_name]), formats=["WEBP", "PNG"]) as image:
-            if image.width * image.height > most_pixels:
-                raise SplatFileError(
-                    f"{place}: {image.width} x {image.height} pixels for {files.count} splats"
-                )
-            return np.asarray(image.convert("RGBA"))[:, :, :channels]
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
-        raise SplatFileError(f"{place}: is not an image ({error}); copy it again") from error
-
-
-def _positions(files: SogFiles, steps: np.ndarray) -> np.ndarray:
-    low, high = (_numbers(files, "means", key, 3).astype(np.float64) for key in ("mins", "maxs"))
-    logs = low + (high - low) * steps / 65535
-    with np.errstate(over="ignore"):  # what is too far is refused by its infinity
-        return (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
-
-
-def _rotations(pixels: np.ndarray) -> np.ndarray:
-    """[M, 4] bytes -> [M, 4] w-x-y-z; zero, which is no rotation, where the tag names no part."""
-    others = (pixels[:, :3] / 255 - 0.5) * _SQRT2
-    largest = (pixels[:, 3] & 3).astype(np.int64)  # tags are 252 to 255
-    wxyz = np.empty((len(pixels), 4))
-    wxyz[np.arange(4) != largest[:, None]] = others.reshape(-1)
-    missing = np.sqrt(np.maximum(1 - (others**2).sum(1), 0))
-    np.put_along_axis(wxyz, largest[:, None], missing[:, None], 1)
-    wxyz[pixels[:, 3] < QUATERNION_TAG] = 0
-    return wxyz.astype(np.float32)
+    """[BOOK] float32."""
+    return numbers_or_null(files, name, "codebook", BOOK)
 
 
 def _palette_entries(files: SogFiles) -> np.ndarray:
     """[count, K, 3] float32."""
-    entry = _entry(files, "shN")
-    bands, count = entry.get("bands", 0), entry.get("count", 0)
+    said = entry(files, "shN")
+    bands, count = said.get("bands", 0), said.get("count", 0)
     whole = isinstance(bands, int) and isinstance(count, int)
     if not (whole and 1 <= bands <= MAX_DEGREE and 0 < count <= MOST_ENTRIES):
         raise SplatFileError(
@@ -416,14 +265,10 @@ def _palette_entries(files: SogFiles) -> np.ndarray:
         )
     coefficients = harmonics_above_dc(bands)
     width = PALETTE_ROW * coefficients
-    pixels = _decoded(files, "shN", 0, 3, width * MOST_ENTRIES // PALETTE_ROW)
-    if pixels.shape[1] != width or pixels.shape[0] * PALETTE_ROW < count:
+    table = decoded(files, "shN", 0, 3, width * MOST_ENTRIES // PALETTE_ROW)
+    if table.shape[1] != width or table.shape[0] * PALETTE_ROW < count:
         raise SplatFileError(
-            f"{files.place}: a palette of {pixels.shape[1]} x {pixels.shape[0]} pixels; expected {width} x "
+            f"{files.place}: a palette of {table.shape[1]} x {table.shape[0]} pixels; expected {width} x "
             f"{-(-count // PALETTE_ROW)} for {count} entries of {bands} bands"
         )
-    labels = _pixels(files, "shN", 1, 2).astype(np.int64) @ np.array([1, 256])
-    book = _codebook(files, "shN")
-    rest = book[pixels.reshape(-1, coefficients, 3)[np.minimum(labels, count - 1)]]
-    rest[labels >= count] = np.nan  # a label that names no entry says nothing of the splat's color
-    return rest
+    return harmonics(files, table, bands, count, _codebook(files, "shN"))
