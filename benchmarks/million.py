@@ -43,7 +43,7 @@ def one_size(anchors: int, steps: int, *, encode: bool) -> dict[str, Any]:
     from compgs.training.allocation import freed_memory_kept
     from compgs.training.checkpoint import Writer
     from compgs.training.distributed import digest
-    from compgs.training.importance import LOOKED_AT
+    from compgs.training.plan import LOOKED_AT
     from compgs.training.profile import StepProfile
     from compgs.training.trainer import PARTS, stations
 

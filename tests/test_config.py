@@ -75,7 +75,7 @@ def test_unknown_names_are_refused_with_the_known_ones():
 def test_every_number_has_a_range_and_its_default_is_in_it(section):
     for name, hint in typing.get_type_hints(section.type, include_extras=True).items():
         plain = typing.get_type_hints(section.type)[name]
-        if plain is bool or typing.get_origin(plain) is typing.Literal or name == "seed":
+        if plain in (bool, str) or typing.get_origin(plain) is typing.Literal or name == "seed":
             continue
         assert typing.get_origin(hint) is typing.Annotated, f"{section.name}.{name} has no range"
         assert isinstance(typing.get_args(hint)[1], Range)

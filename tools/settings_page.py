@@ -16,6 +16,7 @@ from typing import Any
 from compgs import config
 from compgs.config import PRESETS, Range, load_config
 from compgs.outputs import write_bytes
+from compgs.training.plan import RULES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "settings.md"
@@ -39,7 +40,28 @@ def page() -> str:
         kind = type(getattr(presets["default"], section.name))
         parts.append(f"## {section.name}\n\n{summary(kind)}\n")
         parts.append(table(kind, comments_of(source, kind.__name__), section.name, presets))
+    parts.append(rules())
     return "\n".join(parts)
+
+
+RULES_INTRODUCTION = """## rules
+
+What a run decides for itself in place of the settings above, by what is known before its first step
+(`src/compgs/training/plan.py`). `compgs train --plan` prints what it comes to for a scene. `--set training.rules=none`
+applies no rule, as the `paper` preset does; `--set training.rules='all but NAME, NAME'` leaves some out. A size that is
+asked for counts as the lambda that such files come of.
+
+| rule | decides | when | measured |
+|---|---|---|---|
+"""
+
+
+def rules() -> str:
+    """The table of the rules."""
+    return RULES_INTRODUCTION + "".join(
+        f"| `{rule.name}` | `{rule.sets}` | {rule.when} | [{Path(rule.evidence).stem}]({rule.evidence}) |\n"
+        for rule in RULES
+    )
 
 
 def summary(kind: type) -> str:

@@ -59,25 +59,15 @@ class ModelConfig:
 
     # K, per anchor (10 in Sec. 3.4: slower, and no better at the same size)
     coupled_primitives: Annotated[int, Range(1, 64)] = 5
-    # lambda up to which K is twice that, where training views are few (22 and fewer): texture that no smaller lambda
-    # brings there; 0: never (not in the paper)
-    twice_coupled_where_few: Annotated[float, Range(0, 100)] = 1e-4
     # channels of a reference embedding (Sec. 3.4)
     reference_dim: Annotated[int, Range(1, 256)] = 32
     # channels of a residual embedding (Sec. 3.4)
     residual_dim: Annotated[int, Range(1, 64)] = 8
     # True: each anchor has its own K residual embeddings (Sec. 3.1); else all share K of them
     residuals: bool = False
-    # lambda up to which anchors have their own in spite of it, where training views are few (22 and fewer): shared ones
-    # stop to improve there while files grow; 0: never (not in the paper)
-    residuals_where_few: Annotated[float, Range(0, 100)] = 0.001
-    # the same where views are many and a run passes over them 45 times and more
-    residuals_where_many: Annotated[float, Range(0, 100)] = 1e-5
     # pixels^2 of the training photographs that are added to the variances of what is projected (3DGS); the file keeps
     # them as an angle, for pictures of other sizes
     dilation: Annotated[float, Range(0.01, 10)] = 0.3
-    # lambda up to which it is 0.02 instead, where training views are many (23 and more); 0: never (not in the paper)
-    sharp_where_many: Annotated[float, Range(0, 100)] = 0.002
     # hidden width of the residual MLPs (Ref.)
     width: Annotated[int, Range(8, 256, multiple=8)] = 32
     # what reference embeddings are coded around: what anchors around them have that come before in the file (not in
@@ -87,20 +77,13 @@ class ModelConfig:
     # whether symbols of an anchor, or of a coupled primitive, say something about its later ones in the file (not in
     # the paper; training pays for each by itself)
     row_context: bool = True
-    # networks are narrower, their weights of fewer bits, than `width` and `head_bits` say, and there is no such
-    # context, where networks would be much of the file: a large lambda and few anchors, or a small file that is asked
-    # for (not in the paper)
-    networks_by_price: bool = True
     # separate: four networks (Sec. 3.2); paired: geometry, appearance
     heads: Literal["separate", "paired"] = "paired"
-    # lambda up to which networks are separate in spite of it, in runs that pass over the views 45 times and more;
-    # 0: never (not in the paper)
-    separate_where_long: Annotated[float, Range(0, 100)] = 1e-5
     # world units between neighbouring anchors; None: from the points' spacing
     voxel_size: Annotated[float | None, Range(0, above=True)] = None
     # median distances of the points to a voxel, where voxel_size is not given
     voxel_spacings: Annotated[float, Range(0, 1e6, above=True, below=True)] = 1.5
-    # and voxels grow with this power of lambda / 0.002 above it (not in the paper; `training/grid.py`)
+    # and voxels grow with this power of lambda / 0.002 above it (not in the paper; rule `coarser_grid`)
     voxel_rate_exponent: Annotated[float, Range(0, 1)] = 1 / 6
     # anchors start with the colors of the points, in three channels of their references
     point_colors: bool = True
@@ -193,6 +176,9 @@ class TrainingConfig:
     # its power (`training/optimizers.py`); as many views in all need as many times fewer steps
     views_per_step: Annotated[int, Range(1, 1024)] = 1
     seed: Annotated[int, Range(0, (1 << 31) - 1)] = 0
+    # what a run decides for itself in place of these settings (`training/plan.py`, not in the paper): all of its rules,
+    # none, or "all but NAME, NAME"; `compgs train --plan` prints what they come to
+    rules: str = "all"
     # weight of the rate; 0: the entropy networks learn what the latents cost, these do not care
     lmbda: Annotated[float, Range(0, 100)] = 0.002
     # bytes of the file to aim at: lambda, from its setting on, follows it
@@ -354,6 +340,8 @@ def check_config(config: Config) -> None:
             expected = wrong_value(value, hint)
             if expected:
                 raise ConfigError(f"{section.name}.{name} = {value!r}: expected {expected}")
+    if config.training.rules == "none":
+        _check_no_rule_is_set(config)
     if config.model.point_colors and config.model.reference_dim < 3:
         raise ConfigError(
             f"model.point_colors = True: needs a model.reference_dim of 3 or more, found {config.model.reference_dim}"
@@ -363,6 +351,31 @@ def check_config(config: Config) -> None:
             f"splats.reset_opacity = {config.splats.reset_opacity}: expected more than "
             f"splats.prune_opacity, {config.splats.prune_opacity}"
         )
+
+
+# What rules of training read, and what it is without them.
+_OF_RULES: dict[str, float] = {
+    "model.voxel_rate_exponent": 0.0,
+    "control.rate_exponent": 0.0,
+    "control.prune_less": 0.0,
+    "training.left_out": 0.0,
+    "training.coarse_until": 0.0,
+    "training.rate_every": 1,
+    "training.sampled_gradients": 0.0,
+    "training.passed_over": 0.0,
+}
+
+
+def _check_no_rule_is_set(config: Config) -> None:
+    """Raises ConfigError for a setting that only a rule reads, and that is asked for where no rule is applied."""
+    usual = Config()
+    for setting, without in _OF_RULES.items():
+        section, name = setting.split(".")
+        value = getattr(getattr(config, section), name)
+        if value not in (without, getattr(getattr(usual, section), name)):
+            raise ConfigError(
+                f"{setting} = {value!r}: without rules it is {without}; set training.rules = 'all' as well"
+            )
 
 
 def wrong_value(value: Any, hint: Any) -> str:
@@ -377,6 +390,8 @@ def wrong_value(value: Any, hint: Any) -> str:
         if value is None:
             return ""
         hint = next(option for option in options if option is not types.NoneType)
+    if hint is str:
+        return "" if isinstance(value, str) else "a text"
     if hint is bool:
         return "" if isinstance(value, bool) else "true or false"
     if origin is tuple:

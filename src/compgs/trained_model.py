@@ -6,7 +6,7 @@ Training optimizes it, the encoder turns it into a file, `as_hybrid_model` into 
 import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -72,6 +72,21 @@ class SharedResiduals:
         return (residuals * self.step).view(self.shape)
 
 
+class Decisions(Protocol):
+    """What training has decided that the settings leave to it (`training.plan.Plan`)."""
+
+    @property
+    def viewpoints(self) -> int: ...
+
+    @property
+    def row_context(self) -> bool: ...
+
+    @property
+    def head_bits(self) -> int: ...
+
+    def model(self, settings: ModelConfig) -> ModelConfig: ...
+
+
 @dataclass(frozen=True)
 class ModelDimensions:
     """Sizes of a model. It begins with those of the settings and may outgrow them: channels that say nothing go."""
@@ -106,11 +121,13 @@ class TrainedModel(nn.Module):
         distance_unit: float,  # world units, of the view embedding
         background: tuple[float, float, float],
         world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),  # world units, float64
-        made: ModelConfig
-        | None = None,  # what training decides that the settings leave to it; None: as they say
+        plan: Decisions | None = None,  # what training has decided; None: all is as the settings say
+        reference_dim: int | None = None,  # channels that are left; None: all of them
     ) -> None:
         super().__init__()
-        m = made or config.model
+        m = config.model if plan is None else plan.model(config.model)
+        if reference_dim is not None:
+            m = replace(m, reference_dim=reference_dim)
         n = len(coordinates)
         self.config = config
         self.voxel_size = voxel_size
@@ -121,8 +138,12 @@ class TrainedModel(nn.Module):
         # Cameras of the world that stand for all that the scene was trained on, the first for them best; its sky.
         self.viewpoints: tuple[Camera, ...] = ()
         self.up: tuple[float, float, float] = (0.0, -1.0, 0.0)
+        self.plan = plan
+        # Cameras that a file keeps at most, and whether symbols say something about later ones of their row.
+        self.most_viewpoints = config.training.viewpoints if plan is None else plan.viewpoints
+        self.row_context = m.row_context
         # Of the prediction networks' weights in the file; training may decide for fewer than the settings say.
-        self.head_bits = config.entropy.head_bits
+        self.head_bits = config.entropy.head_bits if plan is None else plan.head_bits
         self.heads = make_heads(m.heads, HeadDimensions(m.reference_dim, m.residual_dim, m.width))
         self.entropy = make_entropy_model(m, config.entropy)
         self._neighbourhood: tuple[Tensor, Neighbourhood] | None = None  # of the coordinates as they were
@@ -302,7 +323,7 @@ class TrainedModel(nn.Module):
             self.distance_unit,
             self.background,
             world_offset=self.world_offset,
-            viewpoints=self.viewpoints[: self.config.training.viewpoints],
+            viewpoints=self.viewpoints[: self.most_viewpoints],
             up=self.up,
             angular_dilation=self.angular_dilation,
         )

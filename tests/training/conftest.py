@@ -4,6 +4,8 @@ import pytest
 
 from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig
 
+SIZES_AS_SET = "all but width_16, width_8, no_context, one_bit_less, two_bits_less"
+
 
 @pytest.fixture
 def tiny_config() -> Config:
@@ -14,9 +16,9 @@ def tiny_config() -> Config:
             residuals=True,
             residual_dim=8,
             width=16,
-            networks_by_price=False,  # of a hundred anchors, all that tests look at would be of other sizes
             voxel_size=0.1,
         ),
         control=ControlConfig(start=0.2, stop=0.7, every=0.2, minimum_views=4, gradient_threshold=1e-5),
-        training=TrainingConfig(steps=40, seed=3),
+        # Networks of a hundred anchors would be small, and all that tests look at of other sizes.
+        training=TrainingConfig(steps=40, seed=3, rules=SIZES_AS_SET),
     )

@@ -75,8 +75,9 @@ def test_a_coarse_view_shows_the_same_field(blob_scene: Scene, tiny_config: Conf
 
 
 def test_a_step_renders_and_compares_as_coarsely_as_its_share_of_the_run_asks(
-    blob_scene: Scene, tiny_config: Config
+    blob_scene: Scene, tiny_config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("compgs.training.plan.COARSE_PIXELS", 48 * 36)
     config = replace(tiny_config, training=replace(tiny_config.training, steps=20, coarse_until=0.5))
     trainer = Trainer(blob_scene, config, CPU)
     sizes = []

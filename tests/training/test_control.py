@@ -11,9 +11,10 @@ from compgs.gaussians import Gaussians
 from compgs.tensors.prediction import Prediction
 from compgs.trained_model import TrainedModel
 from compgs.training import target_size
-from compgs.training.control import AdaptiveControl, ControlSchedule, make_schedule, new_cells, rate_weight
+from compgs.training.control import AdaptiveControl, ControlSchedule, make_schedule, new_cells
 from compgs.training.initial import initial_model
 from compgs.training.optimizers import make_optimizer
+from compgs.training.plan import growth_factor
 from compgs.training.rate_control import RateState
 from compgs.training.trainer import Trainer
 
@@ -103,11 +104,12 @@ def test_a_scene_whose_anchors_are_all_transparent_keeps_them(blob_scene, tiny_c
 
 
 def test_an_anchor_has_to_add_more_where_bits_weigh_more(tiny_config):
-    control = replace(tiny_config.control, rate_exponent=0.5)
-    assert rate_weight(control, 0.002) == pytest.approx(1)
-    assert rate_weight(control, 0.008) == pytest.approx(2)
-    assert rate_weight(control, 0.0) == rate_weight(control, 1e-6) < 0.1  # without a rate, too, growth ends
-    assert rate_weight(replace(control, rate_exponent=0.0), 0.008) == 1
+    config = replace(tiny_config, control=replace(tiny_config.control, rate_exponent=0.5))
+    assert growth_factor(config, 0.002) == pytest.approx(1)
+    assert growth_factor(config, 0.008) == pytest.approx(2)
+    assert growth_factor(config, 0.0) == growth_factor(config, 1e-6) < 0.1  # without a rate, too, growth ends
+    flat = replace(config, control=replace(config.control, rate_exponent=0.0))
+    assert growth_factor(flat, 0.008) == 1
 
 
 def test_the_schedule_scales_with_the_run(tiny_config):

@@ -123,10 +123,8 @@ def test_the_state_is_checked(
     [
         ("voxel_size", 0.0), ("voxel_size", float("nan")), ("voxel_size", "1"), ("distance_unit", -1.0),
         ("background", [0, 0]), ("background", None), ("world_offset", [0, 0, float("inf")]), ("up", []),
-        ("viewpoints", [{}]), ("viewpoints", 7), ("viewpoints", [{"fx": 1}]), ("width", 0),
-        ("heads", "both"), ("heads", 1), ("reference_context", 1), ("reference_context", "all"), ("residuals", "no"),
-        ("width", 7), ("width", 1e3), ("width", None), ("head_bits", 0), ("head_bits", 17), ("head_bits", "7"),
-        ("head_bits", True),
+        ("viewpoints", [{}]), ("viewpoints", 7), ("viewpoints", [{"fx": 1}]),
+        ("head_bits", 0), ("head_bits", 17), ("head_bits", "7"), ("head_bits", True),
     ],
     ids=str,
 )  # fmt: skip
@@ -135,6 +133,24 @@ def test_what_a_checkpoint_says_of_the_scene_is_checked(
 ) -> None:
     source, config = written["compgs"]
     path = rewrite(source, tmp_path / "damaged", lambda _, texts: texts["scene"].update({key: value}))
+    with pytest.raises(CheckpointError, match="damaged"):
+        resumed("compgs", blob_scene, path, config)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("width", 0), ("width", 24), ("width", 1e3), ("width", None), ("heads", "both"), ("heads", 1),
+        ("reference_context", 1), ("reference_context", "all"), ("residuals", "no"), ("residuals", False),
+        ("coupled_primitives", 3), ("dropout", 0.9), ("rate_every", 0), ("start", {"anchors": 3}), ("reasons", 1),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_a_checkpoint_says_of_the_plan_is_checked(
+    key: str, value: object, written, blob_scene, tmp_path: Path
+) -> None:
+    source, config = written["compgs"]
+    path = rewrite(source, tmp_path / "damaged", lambda _, texts: texts["plan"].update({key: value}))
     with pytest.raises(CheckpointError, match="damaged"):
         resumed("compgs", blob_scene, path, config)
 

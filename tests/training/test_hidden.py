@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from compgs.config import TrainingConfig
 from compgs.tensors.gradient_sampling import GradientSizes
 from compgs.tensors.rasterize import rasterize
 from compgs.training.hidden import HiddenAnchors
@@ -18,7 +17,7 @@ K = 2
 
 
 def memory(share: float = 0.1, views: int = 3, anchors: int = 4) -> HiddenAnchors:
-    return HiddenAnchors(TrainingConfig(passed_over=share), views, (anchors, K), CPU)
+    return HiddenAnchors(share, views, (anchors, K), CPU)
 
 
 def observed(
@@ -69,9 +68,8 @@ def test_memory_follows_anchors_that_come_and_go():
     assert hidden.others(1, torch.arange(5)).tolist() == [0, 1, 3, 4]
 
 
-@pytest.mark.parametrize("config", [TrainingConfig(passed_over=0.0), TrainingConfig(sampled_gradients=0.0)])
-def test_without_the_setting_or_without_sizes_of_gradients_nothing_is_remembered(config):
-    hidden = HiddenAnchors(config, 3, (4, K), CPU)
+def test_without_a_share_nothing_is_remembered():
+    hidden = memory(share=0.0)
     assert observed(hidden, [0], [0], [0.5], [0.0]) == [0, 1, 2, 3]
     assert hidden.tensors()["hidden"].numel() == 0
 
@@ -88,12 +86,11 @@ def test_where_hardly_anything_is_drawn_nothing_is_hidden():
 
 
 def test_what_one_rank_remembers_comes_back_and_is_of_no_use_to_several():
-    config = TrainingConfig()
     one, other = memory(), memory()
     observed(one, [0, 3], [0, 1, 6, 7], [0.5] * 4, [0.0, 0.0, 1.0, 1.0])
     other.restore(one.tensors())
     assert torch.equal(other.hidden, one.hidden) and one.hidden.any()
-    of_several = HiddenAnchors(replace(config, passed_over=0.0), 3, (4, K), CPU)
+    of_several = memory(share=0.0)
     of_several.restore(one.tensors())
     assert of_several.others(1, torch.arange(4)).tolist() == [0, 1, 2, 3]
     other.restore(of_several.tensors())

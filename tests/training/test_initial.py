@@ -14,9 +14,8 @@ from compgs.scene.points import colors_at
 from compgs.scene.views import Scene
 from compgs.tensors.heads import make_heads
 from compgs.tensors.prediction import predict
-from compgs.training.dilation import dilation
-from compgs.training.grid import grid_spacings
 from compgs.training.initial import initial_model
+from compgs.training.plan import grid_spacings
 
 
 @pytest.mark.parametrize("layout", ["paired", "separate"])
@@ -108,26 +107,6 @@ def test_the_dilation_is_an_angle_in_which_most_cameras_have_the_pixels_that_wer
     assert settings.dilation_of(scene.train_views[1].camera) == pytest.approx(0.5)
     assert model.angular_dilation == float(np.float32(model.angular_dilation))  # as the file has it
     assert model.as_hybrid_model().angular_dilation == model.angular_dilation
-
-
-@pytest.mark.parametrize(
-    ("views", "changes", "pixels"),
-    [
-        (23, {"lmbda": 0.002}, 0.02),
-        (22, {"lmbda": 0.002}, 0.3),
-        (30, {"lmbda": 0.0021}, 0.3),
-        (300, {"lmbda": 0.05, "target_bytes": 5_000}, 0.02),
-        (300, {"lmbda": 1e-6, "target_bytes": 4_999}, 0.3),
-    ],
-)
-def test_splats_are_sharper_where_many_views_look_and_bits_are_cheap(
-    views: int, changes: dict[str, float], pixels: float
-) -> None:
-    config = Config()
-    config = replace(config, training=replace(config.training, **changes))
-    assert dilation(config, 1000, views) == pixels
-    never = replace(config, model=replace(config.model, sharp_where_many=0.0))
-    assert dilation(never, 1000, views) == 0.3
 
 
 def test_the_paper_preset_starts_from_references_of_zero(blob_scene: Scene) -> None:

@@ -33,7 +33,7 @@ def scene(blob_scene: Scene) -> Scene:
 def config(tiny_config: Config) -> Config:
     return replace(
         tiny_config,
-        model=replace(tiny_config.model, networks_by_price=False, residuals=False, voxel_size=0.05),
+        model=replace(tiny_config.model, residuals=False, voxel_size=0.05),
         training=replace(tiny_config.training, steps=30, lmbda=2e-3),
     )
 

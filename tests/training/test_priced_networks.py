@@ -9,10 +9,9 @@ import torch
 
 import compgs
 from compgs.config import Config
-from compgs.losses import RATE_PER_BIT
 from compgs.scene.views import Scene
 from compgs.training.checkpoint import load_checkpoint
-from compgs.training.network_size import head_bits, hidden_width
+from compgs.training.plan import head_bits
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -20,7 +19,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture
 def priced(tiny_config: Config) -> Config:
-    return replace(tiny_config, model=replace(tiny_config.model, networks_by_price=True))
+    return replace(tiny_config, training=replace(tiny_config.training, rules="all"))
 
 
 def of_lambda(config: Config, lmbda: float) -> Config:
@@ -36,8 +35,9 @@ def test_the_file_has_the_width_and_no_weight_of_more_bits(
         trainer.train_step()
     trainer.finish()
     model = trainer.model
-    bits = head_bits(priced, priced.training.lmbda, model.anchors)
-    assert (model.dimensions.width, model.head_bits) == (hidden_width(priced, start), bits) and bits < 7
+    bits = head_bits(priced, trainer.plan.start, priced.training.lmbda, model.anchors)
+    assert trainer.plan.start.anchors == start and trainer.plan.width == 8
+    assert (model.dimensions.width, model.head_bits) == (8, bits) and bits < 7
     compgs.encode(model, tmp_path / "priced.cgs")
     decoded = compgs.decode(tmp_path / "priced.cgs", "cpu")
     for name, tensor in decoded.heads.tensors.items():
@@ -76,12 +76,3 @@ def test_bits_are_settled_once_the_networks_compute_with_them(blob_scene: Scene,
     trainer.rate = replace(trainer.rate, lmbda=1e-9)
     trainer.choose_head_bits()
     assert trainer.model.head_bits == 5
-
-
-def test_the_price_is_what_a_bit_of_the_networks_adds_to_the_objective() -> None:
-    """B bits shared by N anchors add lambda * RATE_PER_BIT * B / N, as B / N more bits of each anchor would."""
-    anchors, lmbda, bits = 500, 0.01, 1000.0
-    stream = {"all": torch.full((anchors,), 20.0)}
-    more = {"all": stream["all"] + bits / anchors}
-    rates = [float(compgs.losses.rate(b, {"all": 1}, "bits")) for b in (stream, more)]
-    assert lmbda * (rates[1] - rates[0]) == pytest.approx(RATE_PER_BIT * bits * lmbda / anchors, rel=1e-4)

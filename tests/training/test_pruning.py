@@ -15,7 +15,7 @@ from compgs.scene.views import Scene, View
 from compgs.tensors.contributions import contributions, signed_changes
 from compgs.tensors.rasterize import rasterize
 from compgs.training.coarse import halved
-from compgs.training.importance import views_to_prune_by
+from compgs.training.plan import pruning_views
 from compgs.training.pruning import judged, paying, random_signs, squared_changes
 from compgs.training.rate_control import RateState
 from compgs.training.trainer import Trainer
@@ -147,7 +147,7 @@ def test_what_only_views_see_that_are_not_asked_outlasts_a_pruning(unequal: Trai
 
 @pytest.mark.parametrize(("views", "asked"), [(12, 48), (81, 48), (97, 49), (300, 150), (1000, 256)])
 def test_a_pruning_asks_half_of_the_views_but_some_at_least(views: int, asked: int) -> None:
-    assert views_to_prune_by(views) == asked
+    assert pruning_views(views) == asked
 
 
 def test_large_views_are_judged_with_sides_halved(unequal: Trainer) -> None:
@@ -198,7 +198,7 @@ BITS = torch.tensor([50.0, 50.0, 50.0, 400.0, 50.0, 50.0, 50.0, 50.0])
 
 
 @pytest.mark.parametrize(
-    ("lmbda", "few", "stays"),
+    ("lmbda", "discount", "stays"),
     [
         (0.0, 0.0, [0, 1, 1, 1, 1, 0, 1, 1]),  # bits cost nothing: only what no view shows goes
         (
@@ -207,16 +207,16 @@ BITS = torch.tensor([50.0, 50.0, 50.0, 400.0, 50.0, 50.0, 50.0, 50.0])
             [0, 1, 1, 0, 1, 0, 1, 1],
         ),  # the fourth is worth more than the first two, but for its bits
         (1.27e-5, 0.0, [0, 0, 1, 0, 1, 0, 1, 1]),
-        (1.27e-5, 1.0, [0, 1, 1, 1, 1, 0, 1, 1]),  # few views: a bit costs a quarter
+        (1.27e-5, 0.75, [0, 1, 1, 1, 1, 0, 1, 1]),  # few views: a bit costs a quarter
         (1.0, 0.0, [0, 0, 0, 0, 1, 0, 1, 1]),  # all are too dear: of those in view at most half
     ],
 )
 def test_those_stay_whose_worth_is_more_than_the_price_of_their_bits(
-    lmbda: float, few: float, stays: list[int]
+    lmbda: float, discount: float, stays: list[int]
 ) -> None:
     """20 x change / bits is 4, 8, 2, 32, 40, 36 x 1e-8 of those in view; a bit costs lambda x 5 / 132 / 8."""
-    control = ControlConfig(prune_worth=20.0, prune_less=0.75)
-    assert paying(CHANGES, BITS, lmbda, control, few).int().tolist() == stays
+    control = ControlConfig(prune_worth=20.0)
+    assert paying(CHANGES, BITS, lmbda, control, discount).int().tolist() == stays
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def test_the_share_that_is_left_is_that_of_all_prunings_to_come(blob_scene, tiny
     changes = torch.rand(model.anchors, generator=chance, dtype=torch.float64)
     size = TargetSize(
         model, make_schedule(control, 40, 8), frozenset({10, 20}),
-        contributions=lambda: weights, changes=lambda: changes, few=0.0,
+        contributions=lambda: weights, changes=lambda: changes, discount=0.0,
     )  # fmt: skip
     with torch.no_grad():
         streams = model.quantized(rate=True, mask=model.mask).bits.values()

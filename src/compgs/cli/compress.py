@@ -204,6 +204,8 @@ def say_what(compression: "Compression") -> None:
         f"{camera.width} x {camera.height} pixels to train with, {len(scene.test_views)} others to judge by, "
         f"{begun.config.training.steps:,} steps"
     )
+    for line in compression.plan.in_words():
+        say(line)
     if compression.goes_on:
         say("goes on from the last checkpoint")
 

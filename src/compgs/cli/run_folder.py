@@ -17,6 +17,7 @@ from compgs.outputs import write_json
 SETTINGS_NAME = "config.json"
 CHECKPOINT_NAME = "checkpoint.safetensors"
 TRAINING_NAME = "training.json"
+RESULTS_NAME = "results.json"
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,8 @@ class RunSettings:
     splats: str | None = None  # file of splats that the run began with
     tiles: str | None = None  # columns x rows, of a run that trains its capture in tiles
     tile: dict[str, Any] | None = None  # of the run of one tile: what of the plan it needs (`tile_entry`)
+    # What the training has decided (`training.plan.Plan.to_dict`); None before it has, and of methods without a plan.
+    plan: dict[str, Any] | None = None
 
 
 def file_name(folder: Path, extension: str = ".cgs") -> str:
@@ -56,9 +59,9 @@ def manifest_of(folder: Path) -> Path:
     return folder / file_name(folder, SUFFIX) / MANIFEST
 
 
-def add_facts(folder: Path, facts: dict[str, Any]) -> dict[str, Any]:
-    """Adds to what training.json says of a run; all of it. Raises OutputError."""
-    path, known = folder / TRAINING_NAME, {}
+def add_facts(folder: Path, facts: dict[str, Any], name: str = TRAINING_NAME) -> dict[str, Any]:
+    """Add to what training.json, or another file of a run, says; returns all of it. Raises OutputError."""
+    path, known = folder / name, {}
     with suppress(OSError, ValueError):  # a run that was stopped after its last step has none
         known = json.loads(path.read_text(encoding="utf-8"))
     facts = {**(known if isinstance(known, dict) else {}), **facts}
@@ -77,6 +80,7 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
         **({"from_splats": settings.splats} if settings.splats is not None else {}),
         **({"tiles": settings.tiles} if settings.tiles is not None else {}),
         **({"tile": settings.tile} if settings.tile is not None else {}),
+        **({"plan": settings.plan} if settings.plan is not None else {}),
     }
     write_json(folder / SETTINGS_NAME, content)
 
@@ -139,7 +143,7 @@ def forget_results(folder: Path) -> None:
 
 def _made_by_runs(folder: Path) -> list[Path]:
     """The checkpoint, and what is made of it in the end."""
-    names = [CHECKPOINT_NAME, TRAINING_NAME, "results.json", "per_view.json"]
+    names = [CHECKPOINT_NAME, TRAINING_NAME, RESULTS_NAME, "per_view.json"]
     suffixes = sorted({method.suffix for method in METHODS.values()})
     files = [file_name(folder, suffix) for suffix in suffixes]
     return [*(folder / name for name in names + files), manifest_of(folder)]
@@ -188,6 +192,7 @@ def run_settings(content: dict[str, Any], place: str) -> RunSettings:
         splats=content.get("from_splats"),
         tiles=_given(content, "tiles", str),
         tile=_given(content, "tile", dict),
+        plan=_given(content, "plan", dict),
     )
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from compgs.cli.command import ReadingOptions, check_measures
 from compgs.cli.console import say
+from compgs.cli.plan import plan_in, planned, say_lines
 from compgs.cli.progress import counting_runs
 from compgs.cli.ranks import several
 from compgs.cli.run_folder import (
@@ -94,17 +95,19 @@ def settings_of_tile(place: str) -> RunSettings:
         tile = plan.tile(name)
     settings = load_settings(Path(path).parent)
     entry = {"ground": ground_entry(plan.ground), **tile.to_dict()}
-    return replace(settings, tiles=None, tile=entry, config=_of_a_tile(settings.config, tile.spacing))
+    return replace(settings, tiles=None, tile=entry, config=_of_a_tile(settings, tile.spacing))
 
 
-def _of_a_tile(config: "Config", spacing: float) -> "Config":
+def _of_a_tile(settings: RunSettings, spacing: float) -> "Config":
     """Voxels as the tile's own points ask for: those outside are perhaps thinned out, and would ask for larger ones.
-    One dilation, however many views see a tile: all are drawn in one picture.
+    All else that a training decides is decided once for the capture, as all tiles are drawn in one picture.
     """
-    from compgs.training.grid import grid_spacings
-
-    m = replace(config.model, sharp_where_many=0.0)
-    return replace(config, model=replace(m, voxel_size=m.voxel_size or grid_spacings(config) * spacing))
+    plan = plan_in(settings)
+    if plan is None:
+        raise CheckpointError(f"{SETTINGS_NAME}: holds no plan for the tiles; train anew")
+    m = settings.config.model
+    size = m.voxel_size or plan.voxel_spacings * spacing
+    return replace(settings.config, model=replace(m, voxel_size=size))
 
 
 def block(scene: "Scene", settings: RunSettings) -> "Scene":
@@ -184,7 +187,9 @@ def _plan(
         plan = plan_tiles(scene, columns, rows)
     except ConfigError as error:
         raise UsageError(f"--{error}") from error
-    settings = replace(settings, tiles=plan.grid)
+    settings = planned(replace(settings, tiles=plan.grid), scene, command.device, columns * rows)
+    assert settings.plan is not None
+    say_lines(settings.plan)
     save_settings(folder, settings)
     write_plan(folder, plan)
     return plan, settings
@@ -193,7 +198,12 @@ def _plan(
 def _what_counts(settings: RunSettings) -> dict[str, Any]:
     """Of a run's settings, what its tiles depend on: not where the scene lies now."""
     reading = {name: value for name, value in asdict(settings.scene).items() if name != "path"}
-    return {"preset": settings.preset, "scene": reading, "config": settings.config.to_dict()}
+    return {
+        "preset": settings.preset,
+        "scene": reading,
+        "config": settings.config.to_dict(),
+        "plan": settings.plan,
+    }
 
 
 def _compute(command: "Train") -> list[str]:

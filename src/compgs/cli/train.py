@@ -21,10 +21,12 @@ from compgs.cli.command import (
 )
 from compgs.cli.console import print_profile, print_results, say
 from compgs.cli.offer import with_poses
+from compgs.cli.plan import plan_in, planned, say_lines, show_plan
 from compgs.cli.progress import counting, training
 from compgs.cli.ranks import among_ranks, several, share_of_threads
 from compgs.cli.run_folder import (
     CHECKPOINT_NAME,
+    RESULTS_NAME,
     TRAINING_NAME,
     EarlierRun,
     RunSettings,
@@ -72,6 +74,8 @@ class Train(ComputingCommand, SceneOptions):
     Examples
 
     compgs train scenes/garden -o runs/garden
+
+    compgs train scenes/garden --plan
 
     compgs train scenes/garden -o runs/quick --preset quick -r 4
 
@@ -146,6 +150,9 @@ class Train(ComputingCommand, SceneOptions):
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace a run that is in RUN already."""
 
+    plan: FlagCreatePairsOff[bool] = False
+    """Print what the run would decide, and about how long it takes and how large the file becomes, and stop."""
+
     profile: FlagCreatePairsOff[bool] = False
     """Print where a step's time goes; training.json has it too."""
 
@@ -187,6 +194,9 @@ class Train(ComputingCommand, SceneOptions):
     """GPUs that a tile takes on a cluster."""
 
     def run(self) -> None:
+        if self.plan:
+            show_plan(self)
+            return
         if self.output is None:
             raise UsageError(
                 "no folder for the run was given: name it with -o, as in `compgs train SCENE -o RUN`"
@@ -215,6 +225,9 @@ class Train(ComputingCommand, SceneOptions):
             if self.resume:
                 say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
             scene, settings = self.read(settings)
+            settings = planned(settings, scene, self.device)
+            if leads and settings.plan is not None:
+                say_lines(settings.plan)
             if not leads:
                 self.train(scene, settings, folder, None, None)
                 return
@@ -374,6 +387,7 @@ class Train(ComputingCommand, SceneOptions):
                     device=self.device,
                     profile=profile,
                     watch=viewing,
+                    plan=plan_in(settings),
                 )
         except KeyboardInterrupt as stop:
             if earlier is not None:
@@ -422,6 +436,8 @@ class Train(ComputingCommand, SceneOptions):
                 method=settings.method,
                 exposure=settings.config.training.exposure,
             )
+        if settings.plan is not None:
+            add_facts(folder, {"plan": settings.plan}, RESULTS_NAME)
         say("")
         print_results(results)
         say("")

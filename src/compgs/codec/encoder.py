@@ -107,7 +107,7 @@ def _coded_model(model: TrainedModel, viewpoints: int | None) -> tuple[FileConte
     coordinates, mask = model.coordinates.cpu()[kept].numpy(), model.mask.cpu()[kept].numpy()
     d = model.dimensions
     # Files of scenes without one are of versions that have no room for it.
-    row_context = model.config.model.row_context and model.angular_dilation is not None
+    row_context = model.row_context and model.angular_dilation is not None
     chain = _Chain(mask, surroundings(coordinates), model.weights.network, row_context)
     for code in (_code_references, _code_log_scales, _code_residuals):
         code(chain, model, kept)
@@ -136,7 +136,7 @@ def _coded_model(model: TrainedModel, viewpoints: int | None) -> tuple[FileConte
 
 
 def _viewpoints(model: TrainedModel, count: int | None, anchors: int) -> Viewpoints | None:
-    count = kept_viewpoints(model.config.training.viewpoints, anchors) if count is None else count
+    count = kept_viewpoints(model.most_viewpoints, anchors) if count is None else count
     cameras = model.viewpoints[:count]
     return viewpoints_from_cameras(cameras, model.up, model.world_offset) if cameras else None
 

@@ -33,8 +33,9 @@ from compgs.methods import train
 from compgs.model.splats import SplatModel
 from compgs.outputs import check_output_file, check_output_folder, write_json
 from compgs.scene.views import Scene
-from compgs.training import TrainingStatus
+from compgs.training import Plan, TrainingStatus, plan_for
 from compgs.training.checkpoint import CHECKPOINT_NAME
+from compgs.training.loop import chosen_device as training_device
 
 SPLATS_PER_ANCHOR = 4.0  # at the start; growth adds anchors, pruning removes them
 HELD_OUT_EVERY = 8  # of given cameras, by name: as scenes are split (`load_scene`)
@@ -128,6 +129,7 @@ class Compression:
     scene: Scene
     file: Path
     device: str
+    plan: Plan  # what the training has decided
     goes_on: bool = False  # from a checkpoint
 
     def train(self, on_progress: Callable[[TrainingStatus], None] | None = None) -> int:
@@ -139,6 +141,7 @@ class Compression:
             resume=self.goes_on,
             on_progress=on_progress,
             device=self.device,
+            plan=self.plan,
         )
         return encode(model, self.file, overwrite=True).bytes
 
@@ -166,7 +169,7 @@ class Compression:
             others=compared.files,
             notes=compared.notes,
         )
-        write_json(folder / "results.json", compressed.to_dict())
+        write_json(folder / "results.json", {**compressed.to_dict(), "plan": self.plan.to_dict()})
         return compressed
 
 
@@ -199,7 +202,8 @@ def begin(
         config = replace(config, training=replace(config.training, steps=steps))
     begun = Begun(source, digest(source), looking, placed, config)
     run.save(folder_of(output), begun)
-    return Compression(begun, splats, scene, output, chosen_device(device))
+    device = chosen_device(device)
+    return Compression(begun, splats, scene, output, device, plan_for(scene, config, training_device(device)))
 
 
 def resumed(output: Path, source: Path | None = None, *, device: str | None = None) -> Compression:
@@ -219,7 +223,9 @@ def resumed(output: Path, source: Path | None = None, *, device: str | None = No
         )
     scene, _ = scene_of(splats, begun.placed, begun.source, begun.config)
     there = (folder / CHECKPOINT_NAME).is_file()
-    return Compression(begun, splats, scene, output, chosen_device(device), goes_on=there)
+    device = chosen_device(device)
+    plan = plan_for(scene, begun.config, training_device(device))
+    return Compression(begun, splats, scene, output, device, plan, goes_on=there)
 
 
 def check_places(output: Path, *, overwrite: bool) -> None:

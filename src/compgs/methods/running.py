@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
     from compgs.training.loop import TrainingStatus, Watch
+    from compgs.training.plan import Plan
     from compgs.training.profile import StepProfile
 
 
@@ -53,6 +54,7 @@ def train(
     device: "Device | None" = None,
     profile: "StepProfile | None" = None,
     watch: "Watch | None" = None,
+    plan: "Plan | None" = None,
 ) -> Any:
     """Train a scene, or the one in a folder, by a method; the result can be rendered, and written by
     `compgs.methods.write` (of `compgs`, also by `compgs.encode`).
@@ -61,8 +63,9 @@ def train(
     `output`, a folder, checkpoints are written there, also when the run is interrupted; `resume` continues from the
     last one exactly as if the run had not stopped (`compgs train --resume` cannot: it does not know how the scene was
     read). `splats`, or a file of them, take the place of the plain 3DGS that a method begins with. `profile` gathers
-    where the time goes. `watch(trainer)` is called between any two steps: `trainer.snapshot()` can be rendered. Default
-    device: CUDA where there is one.
+    where the time goes. `watch(trainer)` is called between any two steps: `trainer.snapshot()` can be rendered. `plan`
+    (`compgs.training.plan_for`) is what has been decided already, as for a tile of a capture; only the method `compgs`
+    has one. Default device: CUDA where there is one.
 
     Raises ConfigError (without torch MissingDependency), CheckpointError, OutputError, SplatFileError, and
     TrainingError when the optimization cannot go on.
@@ -85,6 +88,7 @@ def train(
         device=device,
         profile=profile,
         watch=watch,
+        plan=plan,
     )
     return known.train(read, chosen, run, start)
 

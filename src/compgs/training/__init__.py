@@ -2,8 +2,10 @@
 
 from compgs.training.history import History
 from compgs.training.hooks import Drawn, Hooks
+from compgs.training.initial import plan_for
 from compgs.training.loop import Run, TrainingStatus
 from compgs.training.phases import Phase, fine_tuning, train_phases
+from compgs.training.plan import Plan
 from compgs.training.profile import StepProfile
 from compgs.training.run import load_run
 from compgs.training.splat_trainer import SplatTrainer, train_splats
@@ -14,6 +16,7 @@ __all__ = [
     "History",
     "Hooks",
     "Phase",
+    "Plan",
     "Run",
     "SplatTrainer",
     "StepProfile",
@@ -21,6 +24,7 @@ __all__ = [
     "TrainingStatus",
     "fine_tuning",
     "load_run",
+    "plan_for",
     "train",
     "train_hybrid",
     "train_phases",

@@ -5,7 +5,7 @@ Tensors by name; settings, counters and the view order as JSON in the file's met
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -25,6 +25,7 @@ from compgs.scene.capture import check_camera
 from compgs.scene.points import COORDINATE_BITS
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
+from compgs.training.plan import Plan
 from compgs.training.restoring import (
     check_moments,
     check_step,
@@ -44,6 +45,7 @@ class Checkpoint:
     """State of a run between two steps."""
 
     model: TrainedModel
+    plan: Plan
     optimizer: dict[str, Tensor]  # "<parameter name>/<moment>"
     extra: dict[str, Tensor]  # control statistics, random generators
     state: dict[str, Any]  # step, view order, ... (JSON)
@@ -108,14 +110,10 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, writer: Writer | None = 
                 "up": list(model.up),
                 "angular_dilation": model.angular_dilation,
                 "world_offset": list(model.world_offset),
-                "coupled_primitives": model.dimensions.coupled_primitives,
-                "width": model.dimensions.width,
-                "residuals": model.own_residuals,
-                "heads": model.dimensions.heads,
-                "reference_context": model.entropy.context_of_references,
                 "head_bits": model.head_bits,
             }
         ),
+        "plan": json.dumps(checkpoint.plan.to_dict()),
         "state": json.dumps(checkpoint.state),
     }
     write_checkpoint_file(path, "compgs", tensors, metadata, writer)
@@ -153,14 +151,15 @@ def load_checkpoint(path: Path) -> Checkpoint:
     with restoring(path):
         config = config_from_dict(json.loads(metadata["config"]), str(path))
         parts = tensors_by_kind(tensors)
-        model = _model(config, json.loads(metadata["scene"]), parts["model"])
+        plan = Plan.from_dict(json.loads(metadata["plan"]))
+        model = _model(config, plan, json.loads(metadata["scene"]), parts["model"])
         check_moments(parts["optimizer"], dict(model.named_parameters()))
         state = json.loads(metadata["state"])
         check_step(state, config.training.steps)
-        return Checkpoint(model, parts["optimizer"], parts["extra"], state)
+        return Checkpoint(model, plan, parts["optimizer"], parts["extra"], state)
 
 
-def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) -> TrainedModel:
+def _model(config: Config, plan: Plan, scene: dict[str, Any], tensors: dict[str, Tensor]) -> TrainedModel:
     """Raises ValueError and the like for what does not belong together."""
     coordinates, references = tensors["coordinates"], tensors["references"]
     anchors = len(coordinates)
@@ -168,9 +167,7 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     if anchors == 0 or coordinates.abs().max() >= 1 << (COORDINATE_BITS - 1):
         raise ValueError(f"{anchors} anchors, expected some, at coordinates of {COORDINATE_BITS} bits")
     # Of as many anchors as there are coordinates, before as much memory is taken.
-    few = config.model.coupled_primitives
-    k = whole_number(scene["coupled_primitives"], few, 2 * few, "coupled_primitives")
-    for name, columns in (("log_scales", 6), ("mask", k)):
+    for name, columns in (("log_scales", 6), ("mask", plan.coupled_primitives)):
         if tensors[name].shape != (anchors, columns):
             raise ValueError(f"{name}: expected {[anchors, columns]}, found {list(tensors[name].shape)}")
     if references.shape != (anchors, references.shape[-1]) or not (
@@ -180,23 +177,6 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
     (voxel_size, distance_unit) = finite([scene["voxel_size"], scene["distance_unit"]], 2, "units", above=0.0)
     red, green, blue = finite(scene["background"], 3, "background")
     x, y, z = finite(scene["world_offset"], 3, "world_offset")
-    width = whole_number(scene["width"], 1, config.model.width, "width")
-    residuals, context, layout = scene["residuals"], scene["reference_context"], scene["heads"]
-    if not isinstance(residuals, bool):
-        raise ValueError(f"residuals: expected true or false, found {residuals!r}")
-    if context not in ("neighbours", "hyperprior", "none"):
-        raise ValueError(f"reference_context: expected neighbours, hyperprior or none, found {context!r}")
-    if layout not in ("separate", "paired"):
-        raise ValueError(f"heads: expected separate or paired, found {layout!r}")
-    made = replace(
-        config.model,
-        coupled_primitives=k,
-        reference_dim=references.shape[1],
-        width=width,
-        heads=layout,
-        residuals=residuals,
-        reference_context=context,
-    )
     model = TrainedModel(
         config,
         coordinates,
@@ -204,7 +184,8 @@ def _model(config: Config, scene: dict[str, Any], tensors: dict[str, Tensor]) ->
         distance_unit,
         (red, green, blue),
         (x, y, z),
-        made,
+        plan,
+        references.shape[1],
     )
     if scene["angular_dilation"] is not None:
         (model.angular_dilation,) = finite([scene["angular_dilation"]], 1, "angular_dilation", above=0.0)

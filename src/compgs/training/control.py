@@ -26,12 +26,10 @@ from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
 from compgs.tensors.prediction import Prediction
 from compgs.training.optimizers import AnchorRows, replace_rows
+from compgs.training.plan import growth_factor
 
 # (gradient threshold factor, grid size in voxels), coarse first
 GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
-# lambda for which the settings of growth and pruning are given, and the range in which they follow lambda:
-# below 1e-6 more anchors took half as many bytes again and brought nothing (docs/results/decisions.md)
-USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 COORDINATE_LIMIT = 1 << 20  # voxels: what the octree coder can hold
 # Steps: with fewer views than that, passes are counted as if there were as many, or control would come every few steps.
 # The published scenes have 109 training views and more.
@@ -86,12 +84,6 @@ def make_schedule(config: ControlConfig, steps: int, views: int, views_per_step:
     start, every = max(1, start), max(1, every, math.ceil(views / views_per_step))
     observe = min(pass_steps(config.observe_passes), start + 1 - every)
     return ControlSchedule(start, round(config.stop * steps), every, max(0, observe), views_per_step)
-
-
-def rate_weight(config: ControlConfig, lmbda: float) -> float:
-    """How much more an anchor has to promise than at the usual lambda, since it costs bits."""
-    least, most = LAMBDA_RANGE
-    return (min(max(lmbda, least), most) / USUAL_LAMBDA) ** config.rate_exponent
 
 
 class Grows(AnchorRows, Protocol):
@@ -215,7 +207,7 @@ class AdaptiveControl:
         inside = (target.abs() < COORDINATE_LIMIT - 16).all(1)
         taken = model.coordinates.to(torch.int64)
         room = max(0, self.config.model.max_anchors - model.anchors)
-        threshold = c.gradient_threshold * rate_weight(c, lmbda)
+        threshold = c.gradient_threshold * growth_factor(self.config, lmbda)
         coordinates, references = [taken[:0]], [model.references.detach()[:0]]
         log_scales = [means.new_zeros(0)]
         for level, ((factor, size), probability) in enumerate(

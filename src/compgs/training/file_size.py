@@ -84,7 +84,7 @@ def fixed_bytes(model: TrainedModel) -> int:
             # In halves, as the file has them: means and scales differ in spread.
             bits += sum(gaussian_entropy(half) for half in scaled.tensor_split(2))
             bits += sum(gaussian_entropy(half * 2.0**FRACTION_BITS) for half in bias.tensor_split(2))
-    kept = kept_viewpoints(model.config.training.viewpoints, len(model.coordinates))
+    kept = kept_viewpoints(model.most_viewpoints, len(model.coordinates))
     kept = min(len(model.viewpoints), kept)
     return int(bits / 8) + OTHER_BYTES + (LENS_BYTES + VIEWPOINT_BYTES * kept if kept else 0)
 

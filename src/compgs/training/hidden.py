@@ -15,27 +15,20 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from compgs.config import TrainingConfig
 from compgs.gaussians import Gaussians
 from compgs.losses import FEW_DRAWN
 from compgs.numerics.compiled import njit
 from compgs.tensors.gradient_sampling import GradientSizes
-from compgs.tensors.prediction import Prediction, runs_in_kernels
-from compgs.training.distributed import world
+from compgs.tensors.prediction import Prediction
 from compgs.training.restoring import check_tensor
 
 
 class HiddenAnchors:
     """Of each training view, the anchors that hardly showed when it last looked at them."""
 
-    def __init__(
-        self, config: TrainingConfig, views: int, shape: tuple[int, int], device: torch.device
-    ) -> None:
-        """`shape`: N, K. Nothing is hidden where gradients are not sampled, nor with several ranks: these must look at
-        the same anchors, and each would know of its own views alone.
-        """
-        known = config.sampled_gradients > 0.0 and runs_in_kernels(device) and world() == 1
-        self.share = config.passed_over if known else 0.0
+    def __init__(self, share: float, views: int, shape: tuple[int, int], device: torch.device) -> None:
+        """`share`: of the mean gradient, below which an anchor is hidden; 0: none is. `shape`: N, K."""
+        self.share = share
         anchors, self.coupled_primitives = shape
         remembered = views if self.share > 0.0 else 0
         self.hidden = torch.zeros(anchors, remembered, dtype=torch.bool, device=device)

@@ -5,7 +5,6 @@ views: what it adds to them, whatever its color. Anchors that add least are prun
 for them, and what hardly adds anything is left out of the file.
 """
 
-import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -16,17 +15,6 @@ from compgs.render import RasterSettings
 from compgs.scene.views import View
 from compgs.tensors.contributions import contributions
 from compgs.tensors.prediction import Prediction
-
-# Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
-# up for an error. All views decide what the file leaves out at the end, since a primitive may matter to one alone.
-LOOKED_AT, PRUNED_BY = 48, 256
-
-
-def views_to_prune_by(views: int) -> int:
-    """Of so many: half of them, a pruning then takes half of its time and chooses about the same anchors, but no fewer
-    than there must be for an estimate.
-    """
-    return min(PRUNED_BY, max(LOOKED_AT, math.ceil(views / 2)))
 
 
 def spread(views: Sequence[View], most: int) -> Sequence[View]:

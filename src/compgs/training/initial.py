@@ -1,38 +1,72 @@
 """The model that training starts from."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 
+from compgs.cameras import Camera
+from compgs.codec.format import LARGEST_DILATION, SMALLEST_DILATION
 from compgs.config import MAX_VIEWPOINTS, Config, ModelConfig
 from compgs.errors import ConfigError
 from compgs.numerics.nearest import nearest
+from compgs.render.settings import as_angle
 from compgs.scene.points import colors_at, median_spacing, voxel_grid
 from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
-from compgs.training.dilation import angular_dilation, dilation
-from compgs.training.grid import grid_spacings
-from compgs.training.network_size import head_bits, head_layout, hidden_width, reference_context
-from compgs.training.own_residuals import coupled_primitives, own_residuals
+from compgs.training.distributed import world
+from compgs.training.plan import Plan, Start, grid_spacings, head_bits, lambda_for, plan
+from compgs.training.seen_points import sightings
 
+CPU = torch.device("cpu")
 COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
 
 
-def initial_model(scene: Scene, config: Config) -> TrainedModel:
+def start_of(scene: Scene, config: Config, device: torch.device, anchors: int) -> Start:
+    """What is known of a run on a scene that begins with so many anchors."""
+    t, cameras = config.training, [view.camera for view in scene.train_views]
+    size = t.target_bytes
+    return Start(
+        anchors=anchors,
+        views=len(cameras),
+        sightings=sightings(scene),
+        passes=t.steps * t.views_per_step / max(1, len(cameras)),
+        lmbda=t.lmbda if size is None else lambda_for(size / anchors),
+        pixels=max((camera.width * camera.height for camera in cameras), default=0),
+        device=device.type,
+        processes=world(),
+    )
+
+
+def plan_for(scene: Scene, config: Config, device: torch.device, tiles: int = 1) -> Plan:
+    """What a run on a scene decides; of a capture in so many tiles, for all of their runs. Raises ConfigError."""
+    here = local_scene(scene, world_offset(scene))
+    anchors = len(anchor_grid(here, replace(config.model, voxel_spacings=grid_spacings(config)))[0])
+    return plan(config, start_of(scene, config, device, max(1, round(anchors / tiles))))
+
+
+def initial_model(
+    scene: Scene,
+    config: Config,
+    device: torch.device = CPU,  # of the run: the plan depends on it
+    planned: Plan | None = None,  # of the capture, of which the scene is a tile; None: made for this scene
+) -> TrainedModel:
     """Anchors on the voxel grid of the scene's points (CompGS Sec. 3.4), as large as the distance to their neighbours.
 
     With `point_colors` they have the points' colors, too: from gray, hundreds of steps would go into finding them.
     A scene far from the world's origin gets a `world_offset`, from which its anchors are counted.
     Raises ConfigError if the voxel size that was asked for gives more than `max_anchors`.
     """
-    m = replace(config.model, voxel_spacings=grid_spacings(config))
+    spacings = grid_spacings(config) if planned is None else planned.voxel_spacings
     cameras = [view.camera for view in scene.train_views]
     offset = world_offset(scene)
     scene = local_scene(scene, offset)
+    m = replace(config.model, voxel_spacings=spacings)
     coordinates, voxel_size = anchor_grid(scene, m)
+    chosen = planned or plan(config, start_of(scene, config, device, len(coordinates)))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.training.seed)
         model = TrainedModel(
@@ -42,9 +76,9 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
             scene.extent,
             scene.background,
             offset,
-            made_for(config, len(coordinates), len(cameras)),
+            chosen,
         )
-    model.head_bits = head_bits(config, config.training.lmbda, model.anchors)
+    model.head_bits = head_bits(config, chosen.start, config.training.lmbda, model.anchors)
     with torch.no_grad():
         model.log_scales.copy_(
             torch.from_numpy(np.log(anchor_spacing(coordinates))).float()[:, None].expand(-1, 6)
@@ -57,21 +91,19 @@ def initial_model(scene: Scene, config: Config) -> TrainedModel:
     if cameras:
         model.viewpoints = tuple(cameras[i] for i in choose_viewpoints(cameras, MAX_VIEWPOINTS))
         model.up = up_direction(cameras)
-        pixels = dilation(config, len(coordinates), len(cameras))
-        model.angular_dilation = angular_dilation(pixels, cameras)
+        model.angular_dilation = angular_dilation(chosen.dilation, cameras)
     return model
 
 
-def made_for(config: Config, anchors: int, views: int) -> ModelConfig:
-    """The model of a run that starts with so many anchors, of what the settings leave to training."""
-    return replace(
-        config.model,
-        coupled_primitives=coupled_primitives(config, anchors, views),
-        width=hidden_width(config, anchors),
-        reference_context=reference_context(config, anchors),
-        heads=head_layout(config, anchors, views),
-        residuals=own_residuals(config, anchors, views),
-    )
+def angular_dilation(pixels: float, cameras: Sequence[Camera]) -> float:
+    """The dilation of pixels^2 of the training photographs as an angle, at which pictures of every size are drawn; as a
+    file can hold it, float32.
+
+    3DGS adds 0.3 pixels^2 to the variances of what it projects, whatever the size of the picture: twice as large,
+    splats are too thin; half as large, too thick. A scene of ours keeps the angle of the pixels it was trained with.
+    """
+    angle = min(max(as_angle(pixels, cameras), SMALLEST_DILATION), LARGEST_DILATION)
+    return float(np.float32(angle))
 
 
 def anchor_grid(scene: Scene, m: ModelConfig) -> tuple[np.ndarray, float]:

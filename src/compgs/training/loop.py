@@ -22,6 +22,7 @@ from compgs.tensors.rasterize import rasterize
 from compgs.training.allocation import freed_memory_kept
 from compgs.training.checkpoint import CHECKPOINT_NAME, Writer
 from compgs.training.distributed import local_device, on_any_rank, rank, stopping_together
+from compgs.training.plan import Plan
 from compgs.training.profile import StepProfile
 
 REPORT_EVERY = 10  # steps between two status reports
@@ -65,8 +66,12 @@ class Run:
         device: str | torch.device | None = None,  # None: CUDA where there is one
         profile: StepProfile | None = None,
         watch: "Watch | None" = None,
+        plan: Plan | None = None,
     ) -> None:
-        """Raises ConfigError if there is no folder to resume from."""
+        """`plan`: what has been decided already; None: the run makes its own.
+
+        Raises ConfigError if there is no folder to resume from.
+        """
         if output is None and resume:
             raise ConfigError("resume needs an output folder: the one of the run to continue")
         self.method = method
@@ -77,6 +82,7 @@ class Run:
         devices.prepare_device(str(self.device))
         self.profile = profile
         self.watch = watch
+        self.plan = plan
 
     @property
     def earlier(self) -> Path | None:

@@ -82,7 +82,7 @@ def paying(
     bits: Tensor,  # [N] of each anchor
     lmbda: float,
     control: ControlConfig,
-    few: float,  # `fewness` of the training views
+    discount: float,  # share by which a bit is cheaper than to the objective
     *,
     least_bits: float = 0.0,
     most_bits: float = math.inf,
@@ -92,7 +92,7 @@ def paying(
     than `least_bits`; if they have more than `most_bits`, the best. What no view would miss goes, of the rest at most
     half in a pruning.
     """
-    price = bit_price(lmbda, len(bits)) * (1.0 - control.prune_less * few) * (1.0 + LATER * (prunings - 1))
+    price = bit_price(lmbda, len(bits)) * (1.0 - discount) * (1.0 + LATER * (prunings - 1))
     worth = control.prune_worth * changes / bits.double()
     stays = changes > 0
     most = int((1.0 - (1.0 - MOST) ** prunings) * stays.sum())

@@ -19,7 +19,7 @@ def check_points_seen(scene: Scene, near_plane: float) -> None:
 
     `near_plane`: world units; what is nearer to a camera is not drawn.
     """
-    positions = scene.points.positions[:: max(1, len(scene.points) // LOOKED_AT)].astype(np.float64)
+    positions = _sample(scene)
     seen = np.zeros(len(positions), dtype=bool)
     depths = []
     for view in scene.train_views:
@@ -39,3 +39,17 @@ def check_points_seen(scene: Scene, near_plane: float) -> None:
             f"{scene.name}: {100 * too_near:.0f} % of what the training views see is nearer than {near_plane:g} world "
             f"units, and would not be drawn; scale camera positions and points up, {factor:g} times"
         )
+
+
+def sightings(scene: Scene) -> float:
+    """Training views that have a point in their image, the median over the points: what hides it is not asked."""
+    positions = _sample(scene)
+    counts = np.zeros(len(positions), dtype=np.int64)
+    for view in scene.train_views:
+        counts += depths_in(view.camera, positions)[1]
+    return float(np.median(counts))
+
+
+def _sample(scene: Scene) -> np.ndarray:
+    """[P, 3] float64 points, spread over all of them."""
+    return scene.points.positions[:: max(1, len(scene.points) // LOOKED_AT)].astype(np.float64)

@@ -31,7 +31,7 @@ class TargetSize:
         pruned_at: frozenset[int],
         contributions: Callable[[], Tensor],  # [N, K] of the coupled primitives, to a sample of the views
         changes: Callable[[], Tensor],  # [N] of a sample of the views without an anchor, see `pruning.paying`
-        few: float,  # how few the training views are, 0 to 1
+        discount: float,  # share by which a bit is cheaper to pruning
     ) -> None:
         self.model = model
         self.config = model.config
@@ -39,7 +39,7 @@ class TargetSize:
         self.pruned_at = pruned_at
         self.contributions = contributions
         self.changes = changes
-        self.few = few
+        self.discount = discount
         self.file = FileSize(model)
         target, least = self.config.training.target_bytes, fixed_bytes(model)
         if target is not None and target <= least:
@@ -100,4 +100,4 @@ class TargetSize:
     def lasting_anchors(self, lmbda: float, still: int) -> Tensor:
         """[N] bool: those that outlast so many prunings."""
         bits = anchor_bits(self.model)
-        return paying(self.changes(), bits, lmbda, self.config.control, self.few, prunings=still)
+        return paying(self.changes(), bits, lmbda, self.config.control, self.discount, prunings=still)

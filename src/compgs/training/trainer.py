@@ -66,11 +66,10 @@ from compgs.training.distributed import (
 )
 from compgs.training.dropout import thinned
 from compgs.training.events import Event, at_shares
-from compgs.training.few_views import fewness
 from compgs.training.file_size import anchor_bits, fixed_bytes
 from compgs.training.hidden import HiddenAnchors
-from compgs.training.importance import LOOKED_AT, missed, spread, view_contributions, views_to_prune_by
-from compgs.training.initial import initial_model
+from compgs.training.importance import missed, spread, view_contributions
+from compgs.training.initial import initial_model, start_of
 from compgs.training.loop import (
     Run,
     StepResult,
@@ -81,8 +80,8 @@ from compgs.training.loop import (
     rasterize_step,
     run_to_end,
 )
-from compgs.training.network_size import head_bits
 from compgs.training.optimizers import DECAYS, make_optimizer, parameters_of, set_learning_rates
+from compgs.training.plan import LOOKED_AT, Plan, head_bits, plan
 from compgs.training.profile import StepProfile
 from compgs.training.pruning import judged, paying, squared_changes
 from compgs.training.rate_control import RateState
@@ -125,7 +124,7 @@ def train_hybrid(scene: Scene, config: Config, run: Run) -> TrainedModel:
     if run.earlier:
         trainer = Trainer.resumed(scene, run.earlier, config, run.device)
     else:
-        trainer = Trainer(scene, config, run.device)
+        trainer = Trainer(scene, config, run.device, planned=run.plan)
     if run.profile is not None:
         run.profile.watch(trainer, PARTS, stations)
     trainer.run(run.checkpoint, run.on_progress, run.watch)
@@ -138,21 +137,27 @@ class Trainer:
     kind = "anchors"  # what a progress display counts
 
     def __init__(
-        self, scene: Scene, config: Config, device: torch.device, model: TrainedModel | None = None
+        self,
+        scene: Scene,
+        config: Config,
+        device: torch.device,
+        model: TrainedModel | None = None,
+        planned: Plan | None = None,  # of the capture, of which the scene is a tile
     ) -> None:
         t, views = config.training, len(scene.train_views)
         per_step = t.views_per_step
         self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure, per_step=per_step)
-        self.coarse = CoarseViews(self.views, t.coarse_until)
         self.config = config
         self.device = device
-        self.model = (model or initial_model(scene, config)).to(device)
+        self.model = (model or initial_model(scene, config, device, planned)).to(device)
+        self.plan = plan_of(self.model, scene, device)
+        self.coarse = CoarseViews(self.views, self.plan.coarse_until)
         self.scene = local_scene(scene, self.model.world_offset)
         self.optimizer = make_optimizer(self.model, t)
         self.average = Averaging(self.model)
         self.schedule = make_schedule(config.control, t.steps, views, per_step)
         self.bounds = AnchorBounds(self.model, self.geometry)
-        self.hidden = HiddenAnchors(t, views, self.shape, device)
+        self.hidden = HiddenAnchors(self.plan.passed_over, views, self.shape, device)
         self.control = AdaptiveControl(config, self.schedule, self.shape, device, (self.hidden.replaced,))
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
         self.noise = UniformNoise(t.seed + 3, self.views.chance, device)
@@ -160,14 +165,12 @@ class Trainer:
         self.settings = RasterSettings(
             background=scene.background, angular_dilation=self.model.angular_dilation
         )
-        self.few = fewness(views)
-        self.left_out = t.left_out * self.few
         self.step = 0
         self.rate = RateState(t.lmbda)
         self.decorrelated_at = at_shares(config.entropy.decorrelate_at, t.steps)
         pruned_at = at_shares(config.control.prune_at, t.steps)
         self.target_size = TargetSize(
-            self.model, self.schedule, pruned_at, self.contributions, self.changes, self.few
+            self.model, self.schedule, pruned_at, self.contributions, self.changes, self.plan.bit_discount
         )
         self.events = (
             Event(self.schedule.due, self.grow),
@@ -194,8 +197,7 @@ class Trainer:
         """
         views = self.views.next()
         rows = [self.visible_anchors(self.scene.train_views[view].camera) for view in views]
-        t = self.config.training
-        if self.progress >= t.rate_start and self.step % t.rate_every:
+        if self.progress >= self.config.training.rate_start and self.step % self.plan.rate_every:
             rows = [self.hidden.others(view, of_view) for view, of_view in zip(views, rows, strict=True)]
         return step_views(views, rows, self.model.anchors, self.noise)
 
@@ -280,9 +282,9 @@ class Trainer:
     @property
     def rate_weight(self) -> int:
         """How many steps the rate of this one stands for: it is in the loss of every few, as many times."""
-        t = self.config.training
-        counted = self.progress >= t.rate_start and self.step % t.rate_every == 0
-        return t.rate_every if counted else 0
+        every = self.plan.rate_every
+        counted = self.progress >= self.config.training.rate_start and self.step % every == 0
+        return every if counted else 0
 
     @property
     def stored(self) -> bool:
@@ -302,9 +304,8 @@ class Trainer:
         `sizes` will be those of their gradients.
         """
         prediction = self.predict(latents, rows, camera, self.stored, geometry)
-        gaussians = thinned(prediction, self.left_out, noise)
-        share = self.config.training.sampled_gradients
-        return prediction, with_sampled_gradients(gaussians, share, noise, sizes)
+        gaussians = thinned(prediction, self.plan.dropout, noise)
+        return prediction, with_sampled_gradients(gaussians, self.plan.sampled_gradients, noise, sizes)
 
     def predict(
         self,
@@ -412,7 +413,8 @@ class Trainer:
     def choose_head_bits(self) -> None:
         """As long as the networks do not compute with weights so rounded."""
         if not self.stored:
-            self.model.head_bits = head_bits(self.config, self.rate.lmbda, self.model.anchors)
+            start, anchors = self.plan.start, self.model.anchors
+            self.model.head_bits = head_bits(self.config, start, self.rate.lmbda, anchors)
 
     def skip(self, looks: StepViews) -> StepResult:
         """A step on views that no anchor is in: nothing can be learned from it."""
@@ -453,11 +455,12 @@ class Trainer:
 
     def prune(self) -> None:
         """Remove the anchors that are not worth their bits: what is left of the run makes up for them."""
-        changes = self.changes(views_to_prune_by(len(self.scene.train_views)))
+        changes = self.changes(self.plan.pruning_views)
         bits = anchor_bits(self.model)
         lmbda, written = self.rate.lmbda_of_pruning, self.rate.written
         least, most = self.target_size.bits_that_stay(self.step, bits, written)
-        kept = paying(changes, bits, lmbda, self.config.control, self.few, least_bits=least, most_bits=most)
+        c, discount = self.config.control, self.plan.bit_discount
+        kept = paying(changes, bits, lmbda, c, discount, least_bits=least, most_bits=most)
         if kept.any():
             self.control.keep(self.model, self.optimizer, kept)
 
@@ -572,7 +575,7 @@ class Trainer:
             "averaged": self.average.steps,
         }
         moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
-        save_checkpoint(path, Checkpoint(self.model, moments, extra, state), writer)
+        save_checkpoint(path, Checkpoint(self.model, self.plan, moments, extra, state), writer)
 
     @classmethod
     def resumed(cls, scene: Scene, path: Path, config: Config, device: torch.device) -> "Trainer":
@@ -600,6 +603,13 @@ class Trainer:
             trainer.step = checkpoint.state["step"]
             trainer.rate = RateState.restored(checkpoint.state["rate"])
         return trainer
+
+
+def plan_of(model: TrainedModel, scene: Scene, device: torch.device) -> Plan:
+    """The plan that a model was made by; one that was made without goes by the rules for its scene."""
+    if isinstance(model.plan, Plan):
+        return model.plan
+    return plan(model.config, start_of(scene, model.config, device, model.anchors))
 
 
 def pull_back(tensors: Sequence[Tensor], leaves: Sequence[Tensor], loss: Tensor | None = None) -> None:

@@ -22,7 +22,8 @@ from compgs.methods.parts.fake_quantization import fake_half, fake_levels
 from compgs.methods.parts.vector_quantization import averaged_codes, first_codes, nearest_codes
 from compgs.tensors.splats import Splats
 from compgs.training.hooks import Hooks
-from compgs.training.importance import PRUNED_BY, spread
+from compgs.training.importance import spread
+from compgs.training.plan import PRUNED_BY
 
 if TYPE_CHECKING:
     from compgs.training.splat_trainer import SplatTrainer

@@ -20,7 +20,8 @@ from compgs.tensors.rasterize import rasterize
 from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
 from compgs.tensors.visibility import visible_mask
 from compgs.training.hooks import Hooks
-from compgs.training.importance import PRUNED_BY, spread
+from compgs.training.importance import spread
+from compgs.training.plan import PRUNED_BY
 
 if TYPE_CHECKING:
     from compgs.training.splat_trainer import SplatTrainer

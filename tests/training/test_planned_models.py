@@ -1,4 +1,4 @@
-"""Residual embeddings of their own."""
+"""Runs whose model is not the settings': residuals of their own, more primitives, other networks."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,80 +7,16 @@ import pytest
 import torch
 
 from compgs.codec import decode, encode
-from compgs.config import Config, load_config
+from compgs.config import Config
 from compgs.scene.views import Scene
 from compgs.training.checkpoint import load_checkpoint
-from compgs.training.own_residuals import coupled_primitives, own_residuals
 from compgs.training.trainer import Trainer, train
-
-
-def asked(**training: object) -> Config:
-    return replace(Config(), training=replace(Config().training, **training))
-
-
-def test_anchors_have_their_own_residuals_where_few_views_look_and_bits_are_cheap() -> None:
-    cheap, dear = asked(lmbda=0.001), asked(lmbda=0.005)
-    assert [own_residuals(cheap, 2000, views) for views in (12, 22, 23, 100)] == [True, True, False, False]
-    assert not own_residuals(dear, 2000, 12)
-    assert own_residuals(load_config("paper"), 2000, 100), "as published"
-
-
-@pytest.mark.parametrize(
-    ("lmbda", "steps", "per_step", "own"),
-    [(1e-5, 4500, 1, True), (1e-5, 4499, 1, False), (1e-5, 1125, 4, True), (2e-5, 30_000, 1, False)],
-)
-def test_where_many_views_look_they_have_them_in_long_runs_and_where_bits_cost_next_to_nothing(
-    lmbda: float, steps: int, per_step: int, own: bool
-) -> None:
-    assert own_residuals(asked(lmbda=lmbda, steps=steps, views_per_step=per_step), 2000, 100) == own
-
-
-@pytest.mark.parametrize(("views", "least"), [(12, 24_000), (100, 80_000)])
-def test_a_size_that_is_asked_for_decides_by_its_bytes_for_an_anchor(views: int, least: int) -> None:
-    large, small = asked(target_bytes=least, lmbda=1.0), asked(target_bytes=least - 1, lmbda=0.0)
-    assert own_residuals(large, 2000, views) and not own_residuals(small, 2000, views)
-
-
-@pytest.mark.parametrize("training", [{"lmbda": 0.0}, {"target_bytes": 10**9}])
-@pytest.mark.parametrize(("setting", "views"), [("residuals_where_few", 12), ("residuals_where_many", 100)])
-def test_a_limit_of_zero_keeps_residuals_shared(training: dict[str, float], setting: str, views: int) -> None:
-    config = asked(**training)
-    assert own_residuals(config, 2000, views)
-    config = replace(config, model=replace(config.model, **{setting: 0.0}))
-    assert not own_residuals(config, 2000, views)
-
-
-@pytest.mark.parametrize(
-    ("training", "views", "expected"),
-    [
-        ({"lmbda": 1e-4}, 22, 10),
-        ({"lmbda": 1e-4}, 23, 5),
-        ({"lmbda": 2e-4}, 12, 5),
-        ({"lmbda": 1.0, "target_bytes": 120_000}, 12, 10),
-        ({"lmbda": 0.0, "target_bytes": 119_999}, 12, 5),
-    ],
-)
-def test_anchors_have_twice_as_many_primitives_where_few_views_look_and_bits_are_cheaper_still(
-    training: dict[str, float], views: int, expected: int
-) -> None:
-    config = asked(**training)
-    assert coupled_primitives(config, 2000, views) == expected
-    assert (
-        coupled_primitives(
-            replace(config, model=replace(config.model, twice_coupled_where_few=0)), 2000, views
-        )
-        == 5
-    )
-    assert coupled_primitives(load_config("paper"), 2000, views) == 10, "as published"
-    assert coupled_primitives(
-        replace(config, model=replace(config.model, coupled_primitives=40)), 2000, views
-    ) == (64 if expected == 10 else 40), "as many as a file can hold"
 
 
 def test_a_run_with_twice_as_many_primitives_resumes_and_encodes_as_if_it_had_not_stopped(
     blob_scene: Scene, tiny_config: Config, tmp_path: Path
 ) -> None:
-    model = replace(tiny_config.model, residuals=False, twice_coupled_where_few=1e-4)
+    model = replace(tiny_config.model, residuals=False)
     config = replace(tiny_config, model=model, training=replace(tiny_config.training, lmbda=1e-4))
     device, twice = torch.device("cpu"), 2 * tiny_config.model.coupled_primitives
     whole = Trainer(blob_scene, config, device)
@@ -101,7 +37,7 @@ def test_a_run_with_twice_as_many_primitives_resumes_and_encodes_as_if_it_had_no
 def test_a_run_with_few_views_trains_encodes_and_resumes_with_residuals_of_its_own(
     blob_scene: Scene, tiny_config: Config, tmp_path: Path
 ) -> None:
-    model = replace(tiny_config.model, residuals=False, residuals_where_few=0.002)
+    model = replace(tiny_config.model, residuals=False)
     config = replace(tiny_config, model=model, training=replace(tiny_config.training, steps=4, lmbda=0.001))
     assert len(blob_scene.train_views) <= 22
     trained = train(blob_scene, config, output=tmp_path, device="cpu")
@@ -118,8 +54,7 @@ def test_a_run_with_few_views_trains_encodes_and_resumes_with_residuals_of_its_o
 def test_a_run_for_a_small_file_trains_resumes_and_encodes_without_a_context(
     blob_scene: Scene, tiny_config: Config, tmp_path: Path
 ) -> None:
-    model = replace(tiny_config.model, networks_by_price=True)
-    config = replace(tiny_config, model=model, training=replace(tiny_config.training, lmbda=0.05))
+    config = replace(tiny_config, training=replace(tiny_config.training, lmbda=0.05, rules="all"))
     whole = Trainer(blob_scene, config, torch.device("cpu"))
     assert whole.model.entropy.context_of_references == "none"
     whole.run(None, None)

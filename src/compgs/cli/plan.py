@@ -1,0 +1,100 @@
+"""What a training decides, for people: said before the first step, and by `compgs train --plan`, which stops there."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from compgs.cli.console import say
+from compgs.cli.run_folder import SETTINGS_NAME, RunSettings
+from compgs.cli.usage import UsageError, settings_of_options
+from compgs.errors import CheckpointError
+from compgs.extras import require
+from compgs.words import duration, size
+
+if TYPE_CHECKING:
+    from compgs.cli.train import Train
+    from compgs.scene import Scene
+    from compgs.training import Plan
+
+PLANNED = "compgs"  # the method whose trainings have a plan
+
+
+def show_plan(command: "Train") -> None:
+    """`compgs train --plan`. Raises UsageError, SceneError, ConfigError."""
+    if command.resume or command.tile is not None:
+        raise UsageError(f"--plan: the plan of a run that has begun is in its {SETTINGS_NAME}")
+    require("train", "training")
+    settings = command.settings(command.output or Path())
+    if settings.method != PLANNED:
+        raise UsageError(f"--plan: --method {settings.method} decides nothing; its settings are all there is")
+    command.prepare_training("train")
+    scene, settings = command.read(settings)
+    settings = planned(settings, scene, command.device)
+    plan = plan_in(settings)
+    assert plan is not None and settings.plan is not None
+    say_lines(settings.plan)
+    say_expected(plan, scene, settings, command.device)
+
+
+def planned(settings: RunSettings, scene: "Scene", device: str | None, tiles: int = 1) -> RunSettings:
+    """The settings with the plan of a run on the scene, unless they have one. Raises ConfigError."""
+    if settings.method != PLANNED or settings.plan is not None:
+        return settings
+    from compgs.training import plan_for
+    from compgs.training.loop import chosen_device
+
+    if settings.tiles is not None and tiles == 1:
+        tiles = tiles_of(settings.tiles, scene)
+    with settings_of_options():
+        plan = plan_for(scene, settings.config, chosen_device(device), tiles)
+    return replace(settings, plan=plan.to_dict())
+
+
+def tiles_of(grid: str, scene: "Scene") -> int:
+    """How many tiles a capture is divided into."""
+    from compgs.tiles.plan import grid_for, parse_grid
+
+    columns, rows = parse_grid(grid) or grid_for(scene)
+    return columns * rows
+
+
+def plan_in(settings: RunSettings) -> "Plan | None":
+    """The plan that the settings of a run hold. Raises CheckpointError for what is none."""
+    if settings.plan is None:
+        return None
+    from compgs.training import Plan
+
+    try:
+        return Plan.from_dict(settings.plan)
+    except ValueError as error:
+        raise CheckpointError(f"{SETTINGS_NAME}: {error}; train anew") from error
+
+
+def say_lines(plan: dict[str, Any]) -> None:
+    """The plan for people."""
+    from compgs.training import Plan
+
+    for line in Plan.from_dict(plan).in_words():
+        say(line)
+
+
+def say_expected(plan: "Plan", scene: "Scene", settings: RunSettings, device: str | None) -> None:
+    """How long the run takes, and how large its file becomes, as far as that is known before it."""
+    from compgs.compressing.pace import seconds_per_step
+    from compgs.training.plan import expected_bytes
+
+    steps, asked = settings.config.training.steps, settings.config.training.target_bytes
+    if settings.tiles is not None:
+        say("time: not known for a capture in tiles")
+    else:
+        pace = seconds_per_step(scene, settings.config, device, plan)
+        say(
+            f"time: about {duration(pace * steps)}, {steps:,} steps at the pace of the first ones, {pace:.3f} s each"
+        )
+    bytes_ = expected_bytes(plan.start)
+    if asked is not None:
+        say(f"file: {size(asked)}, as asked for")
+    elif bytes_ is None or settings.tiles is not None:
+        say("file: size not known: no scene of about so many anchors has been measured")
+    else:
+        say(f"file: about {size(round(bytes_))}, measured scenes were within a factor of 3")

@@ -1,0 +1,443 @@
+"""What a run decides for itself, before its first step. This is the one place in training that compares lambda, bytes,
+views or passes with a number.
+
+    settings ─┐
+              ├─► RULES, one after the other ─► Plan ─► model, step, events, file
+    Start   ──┘
+
+A `Start` is what is known of a run before it begins. A rule replaces one value of the settings where its condition
+holds; to remove a rule, delete its entry. The settings `training.rules = "none"` apply none of them, and "all but NAME"
+leaves some out. The plan is printed, and stored with the run. All tiles of a capture have one plan.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from compgs.config import MAX_VIEWPOINTS, Config, ModelConfig
+from compgs.errors import ConfigError
+from compgs.render.settings import LEAST_DILATION
+
+# lambda for which the settings of growth are given, and the range in which it follows lambda: below 1e-6 more anchors
+# took half as many bytes again and brought nothing (docs/results/decisions.md)
+USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
+# A file of b bytes for each anchor of the beginning comes of a lambda of about 0.04 / b^1.5: fitted to the default
+# preset's curves of docs/results (plush and brighton, 1 500 and 5 000 steps, lambda 0.0001 to 0.1). Sizes are met
+# within a factor of 2 (one standard deviation), at worst 3.5.
+ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 1.5
+FEWEST_KNOWN, MOST_KNOWN = (
+    1_000,
+    20_000,
+)  # anchors of the beginning for which that line is known to hold, about
+FEW_VIEWS = 15  # training views, and fewer, are few; twice as many are not any more
+MOST_COUPLED = 64  # primitives of an anchor that a file can hold
+# Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
+# up for an error.
+LOOKED_AT, PRUNED_BY = 48, 256
+COARSE_PIXELS = (
+    160_000  # a photograph of so many pixels, and of more, is halved at first (`shortcuts/coarse.py`)
+)
+
+
+@dataclass(frozen=True)
+class Start:
+    """What is known of a run before its first step."""
+
+    anchors: int  # of the beginning; where a capture is trained in tiles, of one of them on average
+    views: int  # training views; where a capture is trained in tiles, of all of them
+    sightings: float  # training views that show a point, the median over the points
+    passes: float  # over the training views, in the whole run
+    lmbda: float  # the setting, or what a size that is asked for amounts to (`lambda_for`)
+    pixels: int  # of the largest training photograph
+    device: str  # "cpu" or "cuda"
+    processes: int = 1  # of a torchrun
+
+    @property
+    def fewness(self) -> float:
+        """1 where training views are few, 0 where they are many."""
+        return min(1.0, max(0.0, 2.0 - self.views / FEW_VIEWS))
+
+    @property
+    def few(self) -> bool:
+        """Whether training views are rather few than many: up to 22."""
+        return self.fewness >= 0.5
+
+    def often(self, passes: float) -> bool:
+        """Whether the run passes over its training views so often."""
+        return self.passes >= passes
+
+    def costs(self, price: float) -> bool:
+        """Whether a bit of the networks, which all anchors share, has this price of lambda / anchors or more."""
+        return self.lmbda >= price * self.anchors
+
+    def in_words(self) -> str:
+        """One line for people."""
+        return (
+            f"{self.anchors:,} anchors, {self.views} training views, a point is in {self.sightings:g} of them, "
+            f"{self.passes:.1f} passes, lambda {self.lmbda:.3g}, photographs of up to {self.pixels:,} pixels, "
+            f"on {self.device}" + (f" ({self.processes} processes)" if self.processes > 1 else "")
+        )
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A value that a run chooses in place of the settings' one."""
+
+    name: str  # by which `training.rules` leaves it out
+    sets: str  # field of `Plan`
+    to: Callable[[Config, Start, Any], Any]  # the new value, from the value that there was
+    when: str  # the condition, for people
+    holds: Callable[[Start], bool]
+    evidence: str  # what was measured: a page of docs/
+
+
+def growth_factor(config: Config, lmbda: float) -> float:
+    """Factor on the gradient that asks for a new anchor: anchors cost bits. It follows lambda in a run."""
+    if "growth" not in (rule.name for rule in active_rules(config)):
+        return 1.0
+    least, most = LAMBDA_RANGE
+    return (min(max(lmbda, least), most) / USUAL_LAMBDA) ** config.control.rate_exponent
+
+
+def _voxels(config: Config, start: Start, spacings: float) -> float:
+    dearer = min(start.lmbda, LAMBDA_RANGE[1]) / USUAL_LAMBDA
+    return spacings * max(1.0, dearer) ** config.model.voxel_rate_exponent
+
+
+# Where two rules set the same value, the later one goes on from what the earlier one chose.
+RULES: tuple[Rule, ...] = (
+    Rule(
+        "coarser_grid", "voxel_spacings", _voxels,
+        "lambda above 0.002: voxels grow with its power model.voxel_rate_exponent",
+        lambda s: s.lmbda > USUAL_LAMBDA,
+        "log/2026-11-24-21-context.md",
+    ),
+    Rule(
+        "twice_coupled", "coupled_primitives", lambda c, s, k: min(2 * k, MOST_COUPLED),
+        "22 training views and fewer, lambda up to 1e-4",
+        lambda s: s.few and s.lmbda <= 1e-4,
+        "log/2026-11-24-22-time.md",
+    ),
+    Rule(
+        "own_residuals_few", "residuals", lambda c, s, own: True,
+        "22 training views and fewer, lambda up to 0.001",
+        lambda s: s.few and s.lmbda <= 1e-3,
+        "log/2026-11-23-15-residuals.md",
+    ),
+    # 46 passes were enough; with 23 to 43 shared ones were better.
+    Rule(
+        "own_residuals_many", "residuals", lambda c, s, own: True,
+        "23 training views and more, 45 passes and more, lambda up to 1e-5",
+        lambda s: not s.few and s.often(45) and s.lmbda <= 1e-5,
+        "log/2026-11-23-16-top.md",
+    ),
+    Rule(
+        "separate_heads", "heads", lambda c, s, heads: "separate",
+        "45 passes and more, lambda up to 1e-5",
+        lambda s: s.often(45) and s.lmbda <= 1e-5,
+        "log/2026-11-23-17-heads.md",
+    ),
+    # Fox with lambda 0.001 (a price of 1.2e-7) is better with 32, plush (1.6e-7) with 16.
+    Rule(
+        "width_16", "width", lambda c, s, width: min(width, 16),
+        "lambda / anchors of 1.4e-7 and more",
+        lambda s: s.costs(1.4e-7),
+        "log/2026-11-25-31-figures.md",
+    ),
+    Rule(
+        "width_8", "width", lambda c, s, width: min(width, 8),
+        "lambda / anchors of 1.5e-6 and more",
+        lambda s: s.costs(1.5e-6),
+        "log/2026-11-23-13-networks.md",
+    ),
+    # In so small a file a context hardly saves what its network costs.
+    Rule(
+        "no_context", "reference_context", lambda c, s, context: "none",
+        "lambda / anchors of 6e-7 and more",
+        lambda s: s.costs(6e-7),
+        "log/2026-11-24-21-context.md",
+    ),
+    # Of the networks' weights. Asked anew after every step, with lambda and anchors as they are then (`head_bits`).
+    Rule(
+        "one_bit_less", "head_bits", lambda c, s, bits: c.entropy.head_bits - 1,
+        "lambda / anchors of 3e-6 and more",
+        lambda s: s.costs(3e-6),
+        "log/2026-11-23-13-networks.md",
+    ),
+    Rule(
+        "two_bits_less", "head_bits", lambda c, s, bits: c.entropy.head_bits - 2,
+        "lambda / anchors of 3e-5 and more",
+        lambda s: s.costs(3e-5),
+        "log/2026-11-23-13-networks.md",
+    ),
+    Rule(
+        "sharp", "dilation", lambda c, s, pixels: min(pixels, LEAST_DILATION),
+        "23 training views and more, lambda up to 0.002",
+        lambda s: not s.few and s.lmbda <= 0.002,
+        "log/2026-11-24-25-dilation.md",
+    ),
+    # Followed in a run, as lambda changes (`growth_factor`).
+    Rule(
+        "growth", "growth_threshold", lambda c, s, threshold: threshold * growth_factor(c, s.lmbda),
+        "always: it goes with the power control.rate_exponent of lambda / 0.002",
+        lambda s: True,
+        "results/decisions.md",
+    ),
+    Rule(
+        "dropout", "dropout", lambda c, s, share: c.training.left_out * s.fewness,
+        "fewer than 30 training views: training.left_out where 15 or fewer",
+        lambda s: s.fewness > 0,
+        "log/2026-11-22-11-few-views.md",
+    ),
+    Rule(
+        "bit_discount", "bit_discount", lambda c, s, share: c.control.prune_less * s.fewness,
+        "fewer than 30 training views: control.prune_less where 15 or fewer",
+        lambda s: s.fewness > 0,
+        "log/2026-11-22-11-few-views.md",
+    ),
+    Rule(
+        "coarse_photographs", "coarse_until", lambda c, s, share: c.training.coarse_until,
+        "photographs of 160,000 pixels and more: until training.coarse_until of the run",
+        lambda s: s.pixels >= COARSE_PIXELS,
+        "log/2026-11-24-21-context.md",
+    ),
+    Rule(
+        "rate_every", "rate_every", lambda c, s, steps: c.training.rate_every,
+        "always: training.rate_every",
+        lambda s: True,
+        "log/2026-11-25-27-sampling.md",
+    ),
+    Rule(
+        "sampled_gradients", "sampled_gradients", lambda c, s, share: c.training.sampled_gradients,
+        "on the CPU: training.sampled_gradients",
+        lambda s: s.device == "cpu",
+        "log/2026-11-25-27-sampling.md",
+    ),
+    # Several processes must look at the same anchors, and each would know of its own views alone.
+    Rule(
+        "hidden_anchors", "passed_over",
+        lambda c, s, share: c.training.passed_over if c.training.sampled_gradients > 0.0 else 0.0,
+        "on the CPU in one process: training.passed_over, where gradients are sampled",
+        lambda s: s.device == "cpu" and s.processes == 1,
+        "log/2026-11-25-29-hidden.md",
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run has decided. Fields without a rule are the settings'."""
+
+    # the model
+    coupled_primitives: int  # K
+    width: int  # hidden units of the prediction networks
+    heads: Literal["separate", "paired"]
+    residuals: bool  # each anchor has its own K residual embeddings
+    reference_context: Literal["neighbours", "hyperprior", "none"]
+    row_context: bool  # of the file: symbols say something about later ones of their row
+    head_bits: int  # of a weight of the prediction networks, as the run begins
+    voxel_spacings: float  # median distances of the points to a voxel
+    dilation: float  # pixels^2 of the training photographs
+    viewpoints: int  # cameras that the file keeps at most; a small file keeps fewer
+    # training
+    growth_threshold: float  # mean norm of the 2D gradient, as the run begins
+    pruning_views: int  # that are rendered to prune
+    bit_discount: float  # share by which a bit is cheaper to pruning than to the objective
+    dropout: float  # share of the primitives that a step does without
+    # shortcuts, which save time
+    coarse_until: float  # share of the run in which large photographs are halved; 0: none
+    rate_every: int  # steps between two with the rate in the loss
+    sampled_gradients: float  # of the mean gradient: of smaller ones a sample goes on; 0: all do
+    passed_over: float  # of the mean gradient: anchors that showed less are passed over; 0: none are
+    start: Start
+    reasons: Mapping[str, str] = field(default_factory=dict)  # by field, of those that a rule has set
+
+    def model(self, settings: ModelConfig) -> ModelConfig:
+        """The settings of the model, with what the plan has decided in their place."""
+        return replace(
+            settings,
+            coupled_primitives=self.coupled_primitives,
+            width=self.width,
+            heads=self.heads,
+            residuals=self.residuals,
+            reference_context=self.reference_context,
+            row_context=self.row_context,
+            voxel_spacings=self.voxel_spacings,
+            dilation=self.dilation,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Any) -> "Plan":
+        """Inverse of `to_dict`. Raises ValueError for what is no plan."""
+        try:
+            fields = dict(values)
+            start, reasons = Start(**fields["start"]), {str(k): str(v) for k, v in fields["reasons"].items()}
+            plan = cls(**{**fields, "start": start, "reasons": reasons})
+        except (TypeError, KeyError, AttributeError) as error:
+            raise ValueError(f"not the plan of a run ({error})") from error
+        numbers = (start.anchors, start.views, start.sightings, start.passes, start.lmbda, start.pixels)
+        if not all(isinstance(n, int | float) and math.isfinite(n) and n >= 0 for n in numbers):
+            raise ValueError(f"plan: a start that cannot be: {start!r:.200}")
+        for name, (sound, expected) in _expected(plan).items():
+            if not sound:
+                raise ValueError(f"plan: {name}: expected {expected}, found {getattr(plan, name)!r:.60}")
+        return plan
+
+    def in_words(self) -> list[str]:
+        """Lines for people: what the run starts from, then each value with its reason, or when it would be another."""
+        lines = [self.start.in_words()]
+        for each in dataclasses.fields(self):
+            if each.name in ("start", "reasons"):
+                continue
+            value = getattr(self, each.name)
+            shown = f"{value:.3g}" if isinstance(value, float) else str(value)
+            others = [rule.when for rule in RULES if rule.sets == each.name]
+            reason = self.reasons.get(
+                each.name, "" if not others else f"(other with: {'; or '.join(others)})"
+            )
+            lines.append(f"  {each.name:<20}{shown:<12}{reason}".rstrip())
+        return lines
+
+
+def plan(config: Config, start: Start) -> Plan:
+    """The plan of a run. Raises ConfigError for `training.rules` that name no rule."""
+    values, reasons = _by_settings(config, start), {}
+    for rule in active_rules(config):
+        # The grid comes before the anchors, and goes by the setting, whatever size is asked for.
+        known = replace(start, lmbda=config.training.lmbda) if rule.sets == "voxel_spacings" else start
+        if not rule.holds(known):
+            continue
+        value = rule.to(config, known, values[rule.sets])
+        if value != values[rule.sets]:
+            values[rule.sets], reasons[rule.sets] = value, rule.when
+    return Plan(**values, start=start, reasons=reasons)
+
+
+def decided(name: str, config: Config, start: Start) -> Any:
+    """One value of the plan."""
+    value = _by_settings(config, start)[name]
+    for rule in active_rules(config):
+        if rule.sets == name and rule.holds(start):
+            value = rule.to(config, start, value)
+    return value
+
+
+def grid_spacings(config: Config) -> float:
+    """Median distances of the points to a voxel: known before there are anchors."""
+    start = Start(0, 1, 1.0, 1.0, config.training.lmbda, 0, "cpu")
+    return float(decided("voxel_spacings", config, start))
+
+
+def head_bits(config: Config, start: Start, lmbda: float, anchors: int) -> int:
+    """Bits of a weight of the prediction networks, sign included, with lambda and the anchors as they are now."""
+    return int(decided("head_bits", config, replace(start, lmbda=lmbda, anchors=anchors)))
+
+
+def lambda_for(bytes_per_anchor: float) -> float:
+    """lambda that a file of so many bytes for each anchor of the beginning comes of, about. It falls as bytes rise, so
+    that whoever asks for a larger file never gets a smaller model.
+    """
+    return ONE_BYTE_LAMBDA * bytes_per_anchor**-SIZE_EXPONENT
+
+
+def expected_bytes(start: Start) -> float | None:
+    """Bytes of the file, about: the inverse of `lambda_for`. None where it is not known."""
+    if start.lmbda <= 0 or not FEWEST_KNOWN <= start.anchors <= MOST_KNOWN:
+        return None
+    return start.anchors * (ONE_BYTE_LAMBDA / start.lmbda) ** (1 / SIZE_EXPONENT)
+
+
+def active_rules(config: Config) -> tuple[Rule, ...]:
+    """The rules that `training.rules` leaves in force. Raises ConfigError for a name that no rule has."""
+    asked = config.training.rules
+    if asked == "all":
+        return RULES
+    if asked == "none":
+        return ()
+    known = [rule.name for rule in RULES]
+    said, _, names = asked.partition("all but ")
+    without = [name.strip() for name in names.split(",")]
+    if said or not names or not set(without) <= set(known):
+        raise ConfigError(
+            f"training.rules = {asked!r}: expected all, none, or all but some of {', '.join(known)}"
+        )
+    return tuple(rule for rule in RULES if rule.name not in without)
+
+
+def pruning_views(views: int) -> int:
+    """Training views that a pruning renders: half of them, in half of the time that all take; it chooses about the same
+    anchors.
+    """
+    return min(PRUNED_BY, max(LOOKED_AT, math.ceil(views / 2)))
+
+
+def _by_settings(config: Config, start: Start) -> dict[str, Any]:
+    """The plan without any rule."""
+    m, t = config.model, config.training
+    return {
+        "coupled_primitives": m.coupled_primitives,
+        "width": m.width,
+        "heads": m.heads,
+        "residuals": m.residuals,
+        "reference_context": m.reference_context,
+        "row_context": m.row_context,
+        "head_bits": config.entropy.head_bits,
+        "voxel_spacings": m.voxel_spacings,
+        "dilation": m.dilation,
+        "viewpoints": t.viewpoints,
+        "growth_threshold": config.control.gradient_threshold,
+        "pruning_views": pruning_views(start.views),
+        "bit_discount": 0.0,
+        "dropout": 0.0,
+        "coarse_until": 0.0,
+        "rate_every": 1,
+        "sampled_gradients": 0.0,
+        "passed_over": 0.0,
+    }
+
+
+def _expected(plan: Plan) -> dict[str, tuple[bool, str]]:
+    """By field, whether a value from outside is sound, and what was expected."""
+
+    def whole(name: str, least: int, most: int) -> tuple[bool, str]:
+        value = getattr(plan, name)
+        sound = isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+        return sound, f"{least} to {most}"
+
+    def number(name: str, most: float) -> tuple[bool, str]:
+        value = getattr(plan, name)
+        sound = isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value <= most
+        return sound, f"0 to {most:g}"
+
+    def one_of(name: str, *options: object) -> tuple[bool, str]:
+        value = getattr(plan, name)
+        return any(value is o or (value == o and isinstance(o, str)) for o in options), " or ".join(
+            map(str, options)
+        )
+
+    return {
+        "coupled_primitives": whole("coupled_primitives", 1, MOST_COUPLED),
+        "width": whole("width", 1, 256),
+        "heads": one_of("heads", "separate", "paired"),
+        "residuals": one_of("residuals", True, False),
+        "reference_context": one_of("reference_context", "neighbours", "hyperprior", "none"),
+        "row_context": one_of("row_context", True, False),
+        "head_bits": whole("head_bits", 1, 16),
+        "viewpoints": whole("viewpoints", 0, MAX_VIEWPOINTS),
+        "pruning_views": whole("pruning_views", 1, 256),
+        "rate_every": whole("rate_every", 1, 1000),
+        "voxel_spacings": number("voxel_spacings", 1e9),
+        "dilation": number("dilation", 10.0),
+        "growth_threshold": number("growth_threshold", 1e12),
+        "bit_discount": number("bit_discount", 1.0),
+        "dropout": number("dropout", 0.5),
+        "coarse_until": number("coarse_until", 1.0),
+        "sampled_gradients": number("sampled_gradients", 100.0),
+        "passed_over": number("passed_over", 1.0),
+    }
