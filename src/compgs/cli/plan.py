@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from compgs.cli.console import say
 from compgs.cli.run_folder import SETTINGS_NAME, RunSettings
-from compgs.cli.usage import UsageError, settings_of_options
+from compgs.cli.usage import UsageError
 from compgs.errors import CheckpointError
 from compgs.extras import require
 from compgs.words import duration, size
@@ -45,8 +45,7 @@ def planned(settings: RunSettings, scene: "Scene", device: str | None, tiles: in
 
     if settings.tiles is not None and tiles == 1:
         tiles = tiles_of(settings.tiles, scene)
-    with settings_of_options():
-        plan = plan_for(scene, settings.config, chosen_device(device), tiles)
+    plan = plan_for(scene, settings.config, chosen_device(device), tiles)
     return replace(settings, plan=plan.to_dict())
 
 
@@ -87,7 +86,7 @@ def say_expected(plan: "Plan", scene: "Scene", settings: RunSettings, device: st
     if settings.tiles is not None:
         say("time: not known for a capture in tiles")
     else:
-        pace = seconds_per_step(scene, settings.config, device, plan)
+        pace = seconds_per_step(scene, settings.config, device)
         say(
             f"time: about {duration(pace * steps)}, {steps:,} steps at the pace of the first ones, {pace:.3f} s each"
         )

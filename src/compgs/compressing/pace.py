@@ -6,7 +6,7 @@ from dataclasses import replace
 from compgs.config import Config
 from compgs.methods import train
 from compgs.scene.views import Scene
-from compgs.training import Plan, TrainingStatus, plan_for
+from compgs.training import TrainingStatus, plan_for
 from compgs.training.loop import chosen_device
 
 TRIED = 40  # steps; the pace is that of the later ones
@@ -20,15 +20,17 @@ FEWEST = 200  # steps: fewer make nothing that could be looked at
 def steps_within(scene: Scene, config: Config, seconds: float, device: str | None) -> int:
     """Steps of a training that ends about `seconds` from now; FEWEST at least."""
     start = time.perf_counter()
-    pace = seconds_per_step(scene, config, device, plan_for(scene, config, chosen_device(device)))
+    pace = seconds_per_step(scene, config, device)
     left = seconds - (time.perf_counter() - start)
     return max(FEWEST, int(left / (WHOLE_RUN * pace)))
 
 
-def seconds_per_step(scene: Scene, config: Config, device: str | None, plan: Plan) -> float:
-    """Seconds of a step with everything in it, after the first ones, which load and compile kernels. The `plan` is the
-    whole scene's: a few of its views would make another one.
+def seconds_per_step(scene: Scene, config: Config, device: str | None) -> float:
+    """Seconds of a step with everything in it, after the first ones, which load and compile kernels.
+
+    The plan is the whole scene's: the few views that are tried would make another one.
     """
+    plan = plan_for(scene, config, chosen_device(device))
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
     last: list[TrainingStatus] = []
     train(replace(scene, train_views=views), trial(config), device=device, on_progress=last.append, plan=plan)

@@ -3,8 +3,8 @@
 The paper sends a hyperprior z of a few channels beforehand (`Hyperprior`; Ballé et al. 2018). References in their
 principal axes (`training/decorrelation.py`) have little left that z could say of all channels at once: it hardly saves
 what it costs, and with its network and tables it costs more, by 2 % of a file of 30 kB and 5 % of one of 4 kB. So small
-files have none (`NoContext`, rule `no_context` of `training/plan.py`), and others have what anchors around have, which costs nothing
-and says more (`entropy/neighbourhood.py`). But training goes on to pay by a hyperprior: it says of each anchor by
+files have none (`NoContext`, rule `no_context`), and others have what anchors around have, which costs nothing and
+says more (`entropy/neighbourhood.py`). But training goes on to pay by a hyperprior: it says of each anchor by
 itself how far from the others it may be, where neighbours would have all of them alike.
 """
 

@@ -297,10 +297,9 @@ class Plan:
                 continue
             value = getattr(self, each.name)
             shown = f"{value:.3g}" if isinstance(value, float) else str(value)
-            others = [rule.when for rule in RULES if rule.sets == each.name]
-            reason = self.reasons.get(
-                each.name, "" if not others else f"(other with: {'; or '.join(others)})"
-            )
+            others = [r.when for r in RULES if r.sets == each.name and not r.when.startswith("always")]
+            otherwise = f"(another with {'; or with '.join(others)})" if others else ""
+            reason = self.reasons.get(each.name, otherwise)
             lines.append(f"  {each.name:<20}{shown:<12}{reason}".rstrip())
         return lines
 

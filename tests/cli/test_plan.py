@@ -1,0 +1,52 @@
+"""What a training says of its plan, and where it keeps it."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from compgs.cli.main import main
+from compgs.scene.generated import generate_scene
+from compgs.training import Plan, load_run
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("plan") / "scene"
+    generate_scene(folder, views=8, width=48, height=36)
+    return folder
+
+
+def test_a_run_says_its_plan_and_keeps_it_with_settings_results_and_checkpoint(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    options = ["--steps", "4", "--device", "cpu", "--set", "model.max_anchors=60"]
+    assert main(["train", str(scene), "-o", str(run), *options]) == 0
+    said = capsys.readouterr().out
+    kept = Plan.from_dict(json.loads((run / "config.json").read_text())["plan"])
+    assert all(line in said for line in kept.in_words())
+    assert json.loads((run / "results.json").read_text())["plan"] == kept.to_dict()
+    model = load_run(run)
+    assert model.plan == kept
+    assert (model.dimensions.width, model.own_residuals) == (kept.width, kept.residuals)
+
+
+def test_a_plan_alone_trains_nothing(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("compgs.compressing.pace.TRIED", 3)
+    assert main(["train", str(scene), "--plan", "--device", "cpu", "--set", "model.max_anchors=60"]) == 0
+    said = capsys.readouterr().out
+    assert "training views, a point is in" in said and "residuals" in said
+    assert "time: about" in said and "size not known" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("options", [["--method", "3dgs"], ["--resume", "-o", "nowhere"]])
+def test_there_is_no_plan_of_what_decides_nothing_or_has_begun(
+    scene: Path, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", str(scene), "--plan", *options]) == 2
+    assert "--plan" in capsys.readouterr().err
