@@ -1,4 +1,4 @@
-"""Cameras that somebody has already: from COLMAP, from JSON, with or without photographs."""
+"""Cameras that somebody has already: from COLMAP, from JSON, with or without photographs. One reader for all."""
 
 import json
 from pathlib import Path

@@ -50,8 +50,9 @@ class Compare(ComputingCommand, ReadingOptions, MemoryOption):
     scene: Annotated[Path | None, arg(metavar="SCENE", help_behavior_hint=NO_DEFAULT)] = None
     """Folder of the scene whose held-out photographs both are compared with."""
 
-    cameras: Annotated[Path | None, arg(metavar="JSON", help_behavior_hint=NO_DEFAULT)] = None
-    """Camera file to look from, instead of a scene; training and evaluation leave one, cameras.json."""
+    cameras: Annotated[Path | None, arg(metavar="JSON|SCENE", help_behavior_hint=NO_DEFAULT)] = None
+    """Camera file to look from, instead of a scene; training and evaluation leave one, cameras.json. That of 3DGS,
+    transforms.json and the folder of a COLMAP model are read as well."""
 
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="FOLDER", help_behavior_hint=NO_DEFAULT)] = (
         None

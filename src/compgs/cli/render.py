@@ -39,8 +39,9 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
     """Render images or a video from a file of splats: views of a scene, cameras of a JSON file, or a way through it.
 
     A camera file is a list of objects with world_to_camera (4 x 4, OpenCV axes), fx, fy, cx, cy, width and
-    height; training and evaluation leave one, cameras.json, and `compgs view` records one. Images are
-    00000.png, 00001.png, ...; the cameras.json beside them says which is which.
+    height; training and evaluation leave one, cameras.json, and `compgs view` records one. The cameras.json of 3DGS,
+    transforms.json and the folder of a COLMAP model are read as well. Images are 00000.png, 00001.png, ...; the
+    cameras.json beside them says which is which.
 
     Examples
 
@@ -68,8 +69,8 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
     split: Annotated[Literal["test", "train", "all"] | None, arg(help_behavior_hint="(default: test)")] = None
     """Which views of the scene: held out, trained on, or both."""
 
-    cameras: Annotated[Path | None, arg(metavar="JSON", help_behavior_hint=NO_DEFAULT)] = None
-    """Camera file, whose cameras are rendered, instead of a scene."""
+    cameras: Annotated[Path | None, arg(metavar="JSON|SCENE", help_behavior_hint=NO_DEFAULT)] = None
+    """Camera file, or a capture without its photographs, whose cameras are rendered."""
 
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint=f"(default: {FRAMES})")] = None
     """Images of the way through the scene."""
@@ -201,7 +202,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
         from compgs.evaluation.camera_path import read_cameras
 
         file = Path(str(self.path))
-        if not file.is_file():
+        if not file.exists():
             raise UsageError(f"--path {self.path}: expected cameras, orbit or a camera file; there is none")
         keyframes = [camera for _, camera in read_cameras(file)]
         if len(keyframes) < 2:

@@ -1,8 +1,9 @@
-"""Cameras without a data set: read from a JSON file, or on a circle around the scene.
+"""Cameras without photographs: read from a file or a capture, or on a circle around the scene.
 
 A camera file is a list of objects with `world_to_camera` (4 rows of 4 numbers, rigid; OpenCV axes), `fx`,
 `fy`, `cx`, `cy`, `width`, `height` (pixels) and, for people, `name`. `compgs train` and `compgs evaluate`
-leave one of the held-out views.
+leave one of the held-out views. The `cameras.json` of 3DGS is a camera file, too: it has `position`, and `rotation`
+from camera to world, and its principal point is the middle.
 """
 
 import json
@@ -16,10 +17,17 @@ import numpy as np
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
 from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
+from compgs.scene.text_files import decoded
 
 MAX_SIDE = 16_384  # pixels
 
 FIELDS = ("world_to_camera", "fx", "fy", "cx", "cy", "width", "height")
+# By which an entry of the cameras.json of 3DGS is known, and what it has beside that.
+OF_3DGS = ("position", "rotation", "fx", "fy", "width", "height")
+EXPECTED = (
+    "expected the folder of a COLMAP model (sparse/0), transforms.json, transforms_train.json, or a list of cameras as "
+    "3DGS (cameras.json) and compgs write them"
+)
 
 
 def camera_entry(camera: Camera, name: str) -> dict[str, Any]:
@@ -42,6 +50,8 @@ def camera_from_entry(entry: Any, place: str) -> tuple[str, Camera]:
         raise UnsupportedCamera(
             f"{place}: expected an object with {', '.join(FIELDS)}, found {type(entry).__name__}"
         )
+    if OF_3DGS[0] in entry and FIELDS[0] not in entry:
+        entry = _from_3dgs(entry, place)
     missing = [field for field in FIELDS if field not in entry]
     if missing:
         raise UnsupportedCamera(f"{place}: {missing[0]!r} is missing; a camera has {', '.join(FIELDS)}")
@@ -71,25 +81,47 @@ def camera_from_entry(entry: Any, place: str) -> tuple[str, Camera]:
     return str(entry.get("name", place)), Camera(pose, fx, fy, cx, cy, width, height)
 
 
+def _from_3dgs(entry: dict[str, Any], place: str) -> dict[str, Any]:
+    """The fields of a camera as 3DGS writes it, as those of a camera file. Raises UnsupportedCamera."""
+    try:
+        position = np.array(entry["position"], dtype=np.float64).reshape(3)
+        rotation = np.array(entry["rotation"], dtype=np.float64).reshape(3, 3).T
+        fx, fy, width, height = (float(entry[key]) for key in OF_3DGS[2:])
+    except (KeyError, TypeError, ValueError) as error:
+        raise UnsupportedCamera(f"{place}: expected {', '.join(OF_3DGS)} ({error})") from error
+    return {
+        "name": str(entry.get("img_name", place)),
+        "world_to_camera": rigid(rotation, -rotation @ position).tolist(),
+        **{"fx": fx, "fy": fy, "width": width, "height": height},
+        **{"cx": entry.get("cx", width / 2), "cy": entry.get("cy", height / 2)},
+    }
+
+
 def read_cameras(path: Path) -> list[tuple[str, Camera]]:
-    """Names and cameras of a camera file. Raises SceneError."""
+    """Names and cameras of a camera file, or of a capture: a folder, or the JSON file of its poses.
+
+    Raises SceneError.
+    """
+    from compgs.evaluation.capture_cameras import cameras_of_capture, is_capture
+
+    if is_capture(path):
+        return cameras_of_capture(path)
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
+        raise SceneError(f"{path}: cannot be read ({error.strerror}); {EXPECTED}") from error
     return parse_cameras(content, str(path))
 
 
 def parse_cameras(content: bytes, place: str) -> list[tuple[str, Camera]]:
     """Names and cameras of a camera file's content. Raises SceneError with `place` in front."""
     try:
-        entries = json.loads(content.decode("utf-8"))
+        entries = json.loads(decoded(content))
     except (ValueError, RecursionError) as error:
-        raise SceneError(f"{place}: not a camera file: {error}") from error
+        raise SceneError(f"{place}: not a camera file ({error}); {EXPECTED}") from error
     if not isinstance(entries, list) or not entries:
-        raise SceneError(
-            f"{place}: expected a list of cameras, found {type(entries).__name__ if entries else 'none'}"
-        )
+        found = type(entries).__name__ if entries else "none"
+        raise SceneError(f"{place}: not a list of cameras, found {found}; {EXPECTED}")
     return [camera_from_entry(entry, f"{place}: camera {i}") for i, entry in enumerate(entries)]
 
 
