@@ -192,6 +192,7 @@ def evaluate_unrounded(folder: Path) -> dict[str, float]:
         downscale=source.downscale,
         images=source.images,
         test_every=source.test_every,
+        split=source.split,
         background=source.background,
     )
     model = load_run(folder).as_hybrid_model(stored_weights=False)

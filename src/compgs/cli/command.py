@@ -4,13 +4,13 @@ import dataclasses
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.console import say
 from compgs.cli.run_folder import SceneSource
-from compgs.cli.sizes import parse_size
+from compgs.cli.sizes import AUTO, parse_downscale, parse_size
 from compgs.cli.usage import UsageError, check_range, settings_of_options
 from compgs.errors import ConfigError
 from compgs.extras import require
@@ -139,14 +139,27 @@ class SceneFileOrRunArgument:
 class ReadingOptions:
     """How a scene is read."""
 
-    downscale: Annotated[int, arg(aliases=["-r", "--resolution"], metavar="N")] = 1
-    """Read images N times smaller; images_N is used where it exists."""
+    downscale: Annotated[
+        str | None,
+        arg(
+            aliases=["-r", "--resolution"],
+            metavar="N|auto",
+            help_behavior_hint="(default: 1; auto where there is no GPU)",
+        ),
+    ] = None
+    """Read images N times smaller; images_N is used where it exists. auto: photographs of more than 2 megapixels at
+    1600 pixels of their longer side."""
 
     images: Annotated[str, arg(aliases=["-i"], metavar="FOLDER")] = "images"
     """Folder of the images inside the scene."""
 
     test_every: Annotated[int, arg(metavar="N")] = 8
     """Every N-th view, by name, is held out for evaluation."""
+
+    hold_out: Annotated[Literal["auto", "every", "sector"], arg(metavar="auto|every|sector")] = "auto"
+    """Which views are held out. every: one in N by name, between training views. sector: as many around the first by
+    name, a part of the scene that no training view sees from there. auto: those that the capture itself names, else as
+    every."""
 
     background: Annotated[
         tuple[float, float, float] | None, arg(metavar="R G B", help_behavior_hint=NO_DEFAULT)
@@ -156,14 +169,35 @@ class ReadingOptions:
     def source_at(self, path: Path, *, holdout: bool = True) -> SceneSource:
         """Raises UsageError for options that no scene could be read by."""
         self.check_reading()
-        return SceneSource(str(path), self.downscale, self.images, self.test_every, holdout, self.background)
+        ordinary = SceneSource(str(path), 1, "images", 8, holdout, None)
+        given = self.given_reading()
+        if "downscale" not in given and self.is_on_cpu():
+            given["downscale"] = AUTO
+        return dataclasses.replace(ordinary, **given)
+
+    def is_on_cpu(self) -> bool:
+        """Whether the command will compute there. Raises ConfigError for a device that is not there."""
+        from compgs.devices import CPU, chosen_device
+
+        return chosen_device(getattr(self, "device", None)) == CPU
+
+    def given_reading(self) -> dict[str, Any]:
+        """Of the fields of a `SceneSource` those that were given. Raises UsageError."""
+        options = {field.name: field.default for field in dataclasses.fields(ReadingOptions)}
+        given = {name: getattr(self, name) for name in options if getattr(self, name) != options[name]}
+        if "downscale" in given:
+            given["downscale"] = parse_downscale(str(given["downscale"]))
+        if "hold_out" in given:
+            given["split"] = given.pop("hold_out")
+        return given
 
     def check_reading(self) -> None:
         """Raises UsageError."""
         from compgs.scene import check_reading
 
+        downscale = self.given_reading().get("downscale", 1)
         with settings_of_options():
-            check_reading(self.downscale, self.test_every, self.background)
+            check_reading(downscale, self.test_every, self.background, self.hold_out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,10 +219,7 @@ class SceneOptions(ReadingOptions):
     def source_of_run(self, begun: SceneSource) -> SceneSource:
         """As a run read its scene; what is given here goes before that. Raises UsageError."""
         self.check_reading()
-        options = {field.name: field.default for field in dataclasses.fields(ReadingOptions)}
-        given: dict[str, Any] = {
-            name: getattr(self, name) for name in options if getattr(self, name) != options[name]
-        }
+        given = self.given_reading()
         if self.scene or self.source:
             given["path"] = str(one_scene(self.scene, self.source))
         return dataclasses.replace(begun, **given)

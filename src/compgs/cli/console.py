@@ -119,6 +119,8 @@ def print_results(results: "Results") -> None:
         table.add_row("bits per anchor", f"{results.bits_per_anchor:.1f}")
     table.add_row("decoding", duration(results.decode_seconds))
     table.add_row("rendering a view", duration(results.render_seconds))
+    if results.degrees_to_training is not None:
+        table.add_row("to the nearest training view", f"{results.degrees_to_training:.1f}°")
     views = f"{len(results.per_view)} held-out views, {results.width} x {results.height}"
     for note in results.notes:
         warn(in_words_of_options(note))

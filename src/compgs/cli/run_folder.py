@@ -25,11 +25,12 @@ class SceneSource:
     """Which scene a run was trained on, and how it was read: the arguments of `load_scene`."""
 
     path: str
-    downscale: int
+    downscale: int | str  # or auto
     images: str
     test_every: int
     holdout: bool
     background: tuple[float, float, float] | None  # RGB, 0 to 1
+    split: str = "auto"  # which views are held out (`--hold-out`); older runs have none
 
 
 @dataclass(frozen=True)
@@ -230,7 +231,12 @@ def _written_by(folder: Path, settings: RunSettings) -> Path:
 
 def read_otherwise(begun: SceneSource, now: SceneSource) -> str:
     """In what a scene is not read as when a run on it began, as options; empty if there is nothing."""
-    options = {"downscale": "-r", "test_every": "--test-every", "background": "--background"}
+    options = {
+        "downscale": "-r",
+        "test_every": "--test-every",
+        "split": "--hold-out",
+        "background": "--background",
+    }
     differing = [
         f"{option} {_as_typed(getattr(begun, name))} (now {_as_typed(getattr(now, name))})"
         for name, option in options.items()

@@ -19,10 +19,11 @@ def read_scene(source: SceneSource, *, at_once: bool = True) -> "Scene":
     with counting("reading views") as progress:
         scene = load_scene(
             Path(source.path),
-            downscale=source.downscale,
+            downscale=source.downscale,  # type: ignore[arg-type]  # checked there
             images=source.images,
             test_every=source.test_every,
             holdout=source.holdout,
+            split=source.split,  # type: ignore[arg-type]
             background=source.background,
             progress=progress,
             at_once=at_once,

@@ -7,6 +7,8 @@ from compgs.config import MAX_VIEWPOINTS
 
 UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30}
 
+AUTO = "auto"  # of `-r`
+
 SECONDS = {"": 1, "s": 1, "sec": 1, "m": 60, "min": 60, "h": 3600}
 
 
@@ -34,6 +36,16 @@ def parse_size(text: str, option: str) -> int:
     if count < 1:
         raise UsageError(f"{option} {text}: expected at least one byte")
     return count
+
+
+def parse_downscale(text: str) -> int | str:
+    """`4`, or `auto`. Raises UsageError."""
+    if text.strip().lower() == AUTO:
+        return AUTO
+    try:
+        return int(text)
+    except ValueError:
+        raise UsageError(f"--downscale {text}: expected a whole number or {AUTO}") from None
 
 
 def parse_cameras(text: str) -> int:

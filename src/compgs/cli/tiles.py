@@ -155,6 +155,7 @@ def train_tiles(command: "Train", settings: RunSettings) -> None:
     path = Path(settings.scene.path).absolute()  # machines of a cluster start elsewhere
     settings = replace(settings, scene=replace(settings.scene, path=str(path)))
     scene, settings = command.read(settings)
+    command.check_held_out(scene, settings)
     plan, settings = _plan(command, settings, scene, folder)
     jobs = tile_jobs(plan, folder, _what_counts(settings), _compute(command))
     if not command.resume:
@@ -197,7 +198,12 @@ def _plan(
 
 def _what_counts(settings: RunSettings) -> dict[str, Any]:
     """Of a run's settings, what its tiles depend on: not where the scene lies now."""
-    reading = {name: value for name, value in asdict(settings.scene).items() if name != "path"}
+    ordinary = {"split": "auto"}  # runs from before there was another have none
+    reading = {
+        name: value
+        for name, value in asdict(settings.scene).items()
+        if name != "path" and ordinary.get(name) != value
+    }
     return {
         "preset": settings.preset,
         "scene": reading,

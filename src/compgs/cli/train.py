@@ -38,7 +38,7 @@ from compgs.cli.run_folder import (
 )
 from compgs.cli.scenes import read_scene
 from compgs.cli.settings import assigned, check_settings_of, with_settings
-from compgs.cli.sizes import parse_cameras, parse_size
+from compgs.cli.sizes import AUTO, parse_cameras, parse_size
 from compgs.cli.tiles import block, check_options, cut, settings_of_tile, train_tiles
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.cli.viewing import check_viewing, viewing
@@ -228,6 +228,8 @@ class Train(ComputingCommand, SceneOptions):
             settings = planned(settings, scene, self.device)
             if leads and settings.plan is not None:
                 say_lines(settings.plan)
+            if leads and settings.tile is None:
+                self.check_held_out(scene, settings)
             if not leads:
                 self.train(scene, settings, folder, None, None)
                 return
@@ -328,10 +330,10 @@ class Train(ComputingCommand, SceneOptions):
 
     def check_same_reading(self, begun: SceneSource) -> None:
         """Raises UsageError for an option by which the scene would be read otherwise than when the run began."""
-        for name in ("downscale", "images", "test_every", "background"):
-            given, then = getattr(self, name), getattr(begun, name)
-            if given not in (then, getattr(Train, name)):
-                option = f"--{name.replace('_', '-')}"
+        for name, given in self.given_reading().items():
+            then = getattr(begun, name)
+            if given != then:
+                option = "--hold-out" if name == "split" else f"--{name.replace('_', '-')}"
                 raise UsageError(f"{option} {given}: the run to continue began with {then}; leave it out")
         if begun.holdout and not self.eval:
             raise UsageError("--no-eval: the run to continue holds views out; leave it out")
@@ -417,6 +419,12 @@ class Train(ComputingCommand, SceneOptions):
             print_profile(profile.milliseconds())
         return model
 
+    def check_held_out(self, scene: "Scene", settings: RunSettings) -> None:
+        """Raises SceneError, before the first step, for a held-out view that could not be measured after the last."""
+        from compgs.evaluation.held_out import check_held_out
+
+        check_held_out(scene, exposure=settings.config.training.exposure)
+
     def evaluate(self, scene: "Scene", file: Path, folder: Path, settings: RunSettings) -> None:
         if not scene.test_views:
             say("no views are held out (--no-eval): the file was not evaluated")
@@ -469,7 +477,8 @@ def say_miss(folder: Path, target: int) -> None:
 def in_words(settings: RunSettings) -> str:
     """What is trained, and how the scene is read."""
     scene = settings.scene
-    reading = [f"images at 1/{scene.downscale} of their size"] if scene.downscale != 1 else []
+    reading = [f"images at 1/{scene.downscale} of their size"] if scene.downscale not in (1, AUTO) else []
+    reading += [f"views held out by {scene.split}"] if scene.holdout and scene.split != "auto" else []
     reading += [] if scene.holdout else ["no views held out"]
     return ", ".join([scene.path, *reading, f"method {settings.method}", f"preset {settings.preset}"])
 

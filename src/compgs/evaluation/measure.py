@@ -20,6 +20,7 @@ from compgs.evaluation.error_account import ErrorSums
 from compgs.evaluation.error_sheet import error_sheet
 from compgs.evaluation.exposure import DESCRIPTION, exposed_by_left_half, right_half
 from compgs.evaluation.fit import misfits
+from compgs.evaluation.held_out import check_held_out, check_view, degrees_to_training
 from compgs.evaluation.results import Results, ViewResult
 from compgs.formats import component_bytes, open_scene, scene_file, scene_name
 from compgs.numerics.compiling import working_seconds
@@ -78,6 +79,8 @@ def evaluate(
         raise SceneError(
             f"{scene.name}: no view is held out, so there is nothing to evaluate on; load with hold-out"
         )
+    check_held_out(scene, exposure=exposure)
+    angles = degrees_to_training(scene)
     chosen = chosen_device(device)
     model, first_seconds = timed_decode(path, chosen, scene.background)
     model, decode_seconds = timed_decode(path, chosen, scene.background)
@@ -110,6 +113,7 @@ def evaluate(
                 lpips_3dgs=None if distances is None else distances.lpips_3dgs,
                 render_seconds=seconds,
                 flip=metrics.flip(seen, photograph, mask) if flip else None,
+                degrees_to_training=angles[i],
             )
         )
         if sums is not None:
@@ -140,6 +144,7 @@ def evaluate(
         per_view=tuple(rows),
         notes=misfits(model.viewpoints, scene),
         errors=None if sums is None else sums.account(),
+        split=scene.split,
     )
     if output is not None:
         write_evaluation(Path(output), results, scene.test_views, images, truth)
@@ -165,16 +170,11 @@ def compared(
 
     Raises SceneError if the mask leaves nothing.
     """
+    check_view(view, exposure=half)
     photograph, mask = view.image, view.mask
     if half:
         rendering, photograph = right_half(rendering), right_half(photograph)
         mask = None if mask is None else right_half(mask)
-    if mask is not None and not mask.any():
-        where = "of the right half, which is measured, " if half else ""
-        raise SceneError(
-            f"{view.name}: its mask leaves no pixel {where}to evaluate on; mend the mask, or remove the view from the "
-            "poses"
-        )
     return rendering, photograph, mask
 
 

@@ -22,11 +22,14 @@
 | render_seconds | median over the views, after one view to warm up |
 | device, threads | where it ran |
 | sha256 | of the file; of tiles that of the manifest, which has theirs |
+| split | how the held-out views were chosen, in words; empty where that is not known |
+| degrees_to_training | angle from a held-out view to the nearest training view, mean over the views; or null |
 | exposure | null, or how renderings got the exposure of their photographs, and what was measured then |
 | notes | sentences: in what the scene is not what the file was trained on, as far as the file's cameras tell |
 
 `per_view.json`: a list in the views' order with `name`, `file` (of `test/renders` and `test/gt`), `psnr`,
-`ssim`, `lpips`, `lpips_3dgs`, `flip`, `render_seconds`.
+`ssim`, `lpips`, `lpips_3dgs`, `flip`, `render_seconds`, `degrees_to_training`: the angle to the nearest training view
+(`compgs.scene.angles`), or null.
 """
 
 import dataclasses
@@ -52,6 +55,7 @@ class ViewResult:
     render_seconds: float
     flip: float | None = None
     lpips_3dgs: float | None = None  # images given in [0, 1]
+    degrees_to_training: float | None = None  # angle to the nearest training view; None: there is none
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,7 @@ class Results:
     exposure: str | None = None  # how renderings got that of their photographs; None: they did not
     notes: tuple[str, ...] = ()  # in what the scene is not what the file was trained on (`evaluation/fit.py`)
     errors: "ErrorAccount | None" = None  # where the error is, if that was asked for; written to errors.json
+    split: str = ""  # how the held-out views were chosen, in words
 
     @property
     def psnr(self) -> float:
@@ -102,6 +107,12 @@ class Results:
     @property
     def flip(self) -> float | None:
         values = [view.flip for view in self.per_view if view.flip is not None]
+        return fmean(values) if len(values) == len(self.per_view) else None
+
+    @property
+    def degrees_to_training(self) -> float | None:
+        """Mean over the views of the angle to the nearest training view."""
+        values = [view.degrees_to_training for view in self.per_view if view.degrees_to_training is not None]
         return fmean(values) if len(values) == len(self.per_view) else None
 
     @property
@@ -154,6 +165,8 @@ class Results:
             "device": self.device,
             "threads": self.threads,
             "sha256": self.sha256,
+            "split": self.split,
+            "degrees_to_training": self.degrees_to_training,
             "exposure": self.exposure,
             "notes": list(self.notes),
         }

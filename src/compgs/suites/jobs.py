@@ -147,6 +147,8 @@ def _job(
     output: Path,
 ) -> Job:
     reading = ["-r", str(scene.downscale), "--images", scene.images, "--test-every", str(scene.test_every)]
+    if scene.hold_out != "auto":  # not beside those who ran before there was this option
+        reading += ["--hold-out", scene.hold_out]
     options = [part for key, value in suite.train.items() for part in _option(key, value)]
     settings = [f"{key}={_word(value)}" for key, value in {**method.set, **rate}.items()]
     command = [

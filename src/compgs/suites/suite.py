@@ -10,6 +10,7 @@ threads = 1
 [scenes.plush]
 path = "plush_480"                        # inside the data's folder
 downscale = 2
+hold_out = "sector"                       # or "every"; left out, what the capture names, else every test_every-th
 published = "where to get it"             # said where it is missing
 
 [methods."compgs default"]                # the name in tables
@@ -50,6 +51,8 @@ SHIPPED = tuple(
     )
 )
 
+HOLD_OUT = ("auto", "every", "sector")
+
 SetValue = bool | int | float | str | list[Any]
 
 
@@ -62,6 +65,7 @@ class SceneEntry:
     downscale: int = 1
     images: str = "images"
     test_every: int = 8
+    hold_out: str = "auto"  # auto, every or sector: as --hold-out of `compgs train`
     published: str = ""  # where it can be had
 
 
@@ -185,6 +189,10 @@ def _entry(kind: type, name: str, values: dict[str, Any], place: str) -> Any:
         expected = kinds.get(key, str)
         if type(value) is not expected:
             raise ConfigError(f"{place}.{key}: expected {expected.__name__}, found {value!r}")
+    if kind is SceneEntry and values.get("hold_out", "auto") not in HOLD_OUT:
+        raise ConfigError(
+            f"{place}.hold_out: expected one of {', '.join(HOLD_OUT)}, found {values['hold_out']!r}"
+        )
     required = {"path"} if kind is SceneEntry else {"method"}
     for key in required - set(values):
         raise ConfigError(f"{place}: {key} is missing")

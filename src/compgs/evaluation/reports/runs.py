@@ -194,6 +194,7 @@ def _named_apart(found: Sequence[_Found]) -> list[Run]:
         else each
         for each in found
     ]
+    scened = _split_apart(scened)
     named = []
     for each in scened:
         differing = _differing(each, scened)
@@ -202,6 +203,23 @@ def _named_apart(found: Sequence[_Found]) -> list[Run]:
         rate = ", ".join([*([each.run.rate] if each.run.rate else []), *own])
         named.append(replace(each.run, method=method, rate=rate))
     return named
+
+
+def _split_apart(found: Sequence[_Found]) -> list[_Found]:
+    """Names of scenes with how views were held out, where that differs."""
+    splits: dict[str, set[str]] = {}
+    for each in found:
+        splits.setdefault(each.run.scene, set()).add(_split(each.run))
+    return [
+        replace(each, run=replace(each.run, scene=f"{each.run.scene} ({_split(each.run)})"))
+        if _split(each.run) and len(splits[each.run.scene]) > 1
+        else each
+        for each in found
+    ]
+
+
+def _split(run: Run) -> str:
+    return str(run.results.get("split") or "")
 
 
 def _size(run: Run) -> tuple[int, int]:

@@ -51,6 +51,7 @@ NUMBERS = (
     Column("encode_seconds", "encoding, s", ".3f"),
     Column("decode_seconds", "decoding, s", ".3f"),
     Column("frames_per_second", "frames/s", ".1f"),
+    Column("degrees_to_training", "to training views, degrees", ".1f"),
 )
 COLUMNS = {column.key: column for column in (*NAMES, *NUMBERS)}
 
@@ -282,6 +283,7 @@ def views_table(points: Sequence[Point]) -> Table:
         Column("lpips", "LPIPS", ".4f"),
         Column("lpips_3dgs", "LPIPS as 3DGS", ".4f"),
         Column("flip", "FLIP", ".4f"),
+        Column("degrees_to_training", "to training views, degrees", ".1f"),
     )
     rows: list[tuple[Value, ...]] = []
     for scene in scenes(points):
@@ -292,7 +294,8 @@ def views_table(points: Sequence[Point]) -> Table:
                 if found:
                     values = (fmean(psnr(each) for each in found), fmean(each["ssim"] for each in found))
                     more = (
-                        _mean([each.get(key) for each in found]) for key in ("lpips", "lpips_3dgs", "flip")
+                        _mean([each.get(key) for each in found])
+                        for key in ("lpips", "lpips_3dgs", "flip", "degrees_to_training")
                     )
                     rows.append((scene, view, point.method, point.rate or None, *values, *more))
     return Table("views", "Views", columns, tuple(rows)).without_empty_columns()
