@@ -103,6 +103,32 @@ def test_flags_of_3dgs_mean_the_same() -> None:
     assert underscores.settings(Path("run")).scene == ours.settings(Path("run")).scene
 
 
+def test_large_photographs_are_reduced_on_the_cpu_unless_somebody_says_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def downscale(*options: str) -> int | str:
+        return train("scene", "-o", tmp_path / "run", *options).settings(tmp_path / "run").scene.downscale
+
+    monkeypatch.setattr("compgs.devices.chosen_device", lambda device: device or "cpu")
+    assert [downscale(), downscale("-r", "1"), downscale("-r", "auto")] == ["auto", 1, "auto"]
+    monkeypatch.setattr("compgs.devices.chosen_device", lambda device: device or "cuda")
+    assert [downscale(), downscale("-r", "auto"), downscale("--device", "cpu")] == [1, "auto", "auto"]
+    with pytest.raises(UsageError, match="--downscale half: expected a whole number or auto"):
+        downscale("-r", "half")
+
+
+def test_a_run_remembers_which_views_are_held_out(tmp_path: Path) -> None:
+    begun = train("scene", "-o", tmp_path, "--hold-out", "sector").settings(tmp_path)
+    assert begun.scene.split == "sector"
+    save_settings(tmp_path, begun)
+    (tmp_path / CHECKPOINT_NAME).touch()
+    assert train("-o", tmp_path, "--resume").settings(tmp_path) == begun
+    content = json.loads((tmp_path / "config.json").read_text())
+    del content["scene"]["split"]  # as runs have it that began before there was a choice
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    assert load_settings(tmp_path).scene.split == "auto"
+
+
 def test_a_run_remembers_how_it_began(tmp_path: Path) -> None:
     begun = train(
         "scene", "-o", tmp_path, "--preset", "quick", "-r", "2", "--no-eval", "--background", "0.5", "0", "1"
@@ -245,6 +271,7 @@ def test_a_checkpoint_that_is_written_at_the_very_end_counts(finished: Path) -> 
         ["-r", "2"],
         ["--images", "photos"],
         ["--test-every", "4"],
+        ["--hold-out", "sector"],
         ["--no-eval"],
         ["--background", "1", "0", "0"],
     ],

@@ -131,6 +131,40 @@ def test_files_say_what_the_results_say(file: Path, tmp_path: Path) -> None:
     assert not list(output.rglob("*.partial"))
 
 
+def test_results_say_how_far_held_out_views_are_from_training_views(file: Path) -> None:
+    """Cameras in one place that look 10, 30 and 50 degrees aside of the only one that was trained on."""
+    flat = make_scene([101, 110, 90, 80])
+
+    def aside(view: View, degrees: float) -> View:
+        turn, (c, s) = np.eye(4), (np.cos(np.radians(degrees)), np.sin(np.radians(degrees)))
+        turn[0, 0] = turn[2, 2] = c
+        turn[0, 2], turn[2, 0] = s, -s
+        return replace(view, camera=replace(view.camera, world_to_camera=turn))
+
+    views = [aside(view, degrees) for view, degrees in zip(flat.test_views, (0, 10, 30, -50), strict=True)]
+    scene = replace(flat, train_views=tuple(views[:1]), test_views=tuple(views[1:]), split="by hand")
+    results = evaluate(file, scene, device="cpu")
+    assert [view.degrees_to_training for view in results.per_view] == pytest.approx([10, 30, 50])
+    assert results.to_dict()["degrees_to_training"] == pytest.approx(30)
+    assert results.to_dict()["split"] == "by hand"
+    alone = evaluate(file, replace(scene, train_views=()), device="cpu")
+    assert alone.degrees_to_training is None and alone.per_view[0].degrees_to_training is None
+
+
+@pytest.mark.parametrize("exposure", [False, True])
+def test_held_out_views_that_cannot_be_measured_are_named_before_anything_is_rendered(
+    file: Path, exposure: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = make_scene([101, 110, 90])
+    mask = np.zeros((24, 32), dtype=bool)
+    mask[:, :16] = exposure  # of the right half nothing
+    masked = replace(scene.test_views[2], counted=mask)
+    scene = replace(scene, test_views=(*scene.test_views[:2], masked))
+    monkeypatch.setattr("compgs.evaluation.measure.timed_render", lambda *_: pytest.fail("rendered"))
+    with pytest.raises(SceneError, match=r"folder/2\.jpg: its mask leaves no pixel"):
+        evaluate(file, scene, device="cpu", exposure=exposure)
+
+
 def test_an_existing_report_is_kept_unless_asked(file: Path, tmp_path: Path) -> None:
     output = tmp_path / "report"
     evaluate(file, make_scene([101, 110, 90]), output=output, device="cpu")

@@ -103,7 +103,7 @@ def test_a_scene_is_held_out_by_sector_where_that_is_asked_for(write_capture: Wr
     scene = load_scene(folder, split="sector")
     assert {view.name for view in scene.test_views} == {"23.png", "00.png", "01.png"}
     assert len(scene.train_views) == 21
-    assert scene.split == "a sector of 3 views" and load_scene(folder).split == "one in 8 by name"
+    assert scene.split == "a sector of 3 of 24 views" and load_scene(folder).split == "one in 8 by name"
     assert load_scene(folder, split="sector", holdout=False).test_views == ()
     assert len(load_scene(folder, split="sector", test_every=4).test_views) == 6
     with pytest.raises(ConfigError, match="split 'half': expected one of auto, every, sector"):

@@ -36,6 +36,25 @@ def test_a_run_is_the_command_that_a_person_would_type(suite: Suite, tmp_path: P
     assert train.threads == 1
 
 
+def test_a_suite_may_hold_a_sector_out(tmp_path: Path) -> None:
+    text = """
+[scenes.plush]
+path = "plush"
+[scenes."plush sector"]
+path = "plush"
+hold_out = "sector"
+[methods.3dgs]
+method = "3dgs"
+"""
+    suite = parse_suite(text, "suite")
+    plain, sector = jobs_of(suite, Path("/data"), tmp_path)
+    assert "--hold-out" not in plain.command  # nor before there was this option: such runs are not repeated
+    train = parse([*sector.command, "-o", "out"])
+    assert isinstance(train, Train) and train.settings(Path("out")).scene.split == "sector"
+    with pytest.raises(ConfigError, match=r"hold_out: expected one of auto, every, sector, found 'half'"):
+        parse_suite(text.replace('"sector"', '"half"'), "suite")
+
+
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_suites_are_read_and_their_runs_are_commands(name: str, tmp_path: Path) -> None:
     suite = load_suite(name)

@@ -270,7 +270,7 @@ def _held_out(
     if split == "sector":
         cameras = [view.camera for view in views]
         chosen = sector(names, cameras, points.positions, extent, test_every)
-        return chosen, f"a sector of {len(chosen)} views", notes
+        return chosen, f"a sector of {len(chosen)} of {len(names)} views", notes
     return every(names, test_every), f"one in {test_every} by name", notes
 
 

@@ -73,6 +73,19 @@ def test_a_scene_in_two_sizes_is_two_scenes(make_run: Maker) -> None:
     assert [scene for scene, *_ in names(folders)] == ["garden (48 px)", "garden (96 px)", "room"]
 
 
+def test_a_scene_of_which_a_sector_is_held_out_is_another_scene(make_run: Maker) -> None:
+    folders = [
+        make_run("a"),
+        make_run("b", results={"split": "one in 8 by name"}),
+        make_run("c", results={"split": "a sector of 3 of 24 views"}),
+    ]
+    assert [scene for scene, *_ in names(folders)] == [
+        "garden",
+        "garden",
+        "garden (a sector of 3 of 24 views)",
+    ]
+
+
 def test_a_folder_of_runs_stands_for_them(make_run: Maker) -> None:
     inside = [make_run("a"), make_run("b", lmbda=0.1)]
     (inside[0].parent / "notes").mkdir()

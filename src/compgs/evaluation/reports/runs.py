@@ -16,6 +16,7 @@ from compgs.errors import ReportError
 
 RESULTS_NAME = "results.json"
 SCHEMA = "compgs results 1"
+USUAL_SPLIT = "one in 8 by name"  # of `split` in results.json
 NEEDED = ("scene", "psnr", "ssim", "bytes", "components", "width", "height")  # of results.json
 # Settings of which a run's rate and seed are known already.
 RATE_SETTINGS = ("training.lmbda", "training.target_bytes")
@@ -206,20 +207,19 @@ def _named_apart(found: Sequence[_Found]) -> list[Run]:
 
 
 def _split_apart(found: Sequence[_Found]) -> list[_Found]:
-    """Names of scenes with how views were held out, where that differs."""
+    """Names of scenes with how views were held out, where runs differ in that and it is not the usual way."""
     splits: dict[str, set[str]] = {}
     for each in found:
-        splits.setdefault(each.run.scene, set()).add(_split(each.run))
-    return [
-        replace(each, run=replace(each.run, scene=f"{each.run.scene} ({_split(each.run)})"))
-        if _split(each.run) and len(splits[each.run.scene]) > 1
-        else each
-        for each in found
-    ]
+        if split := str(each.run.results.get("split") or ""):  # runs from before this was noted are usual
+            splits.setdefault(each.run.scene, {USUAL_SPLIT}).add(split)
 
+    def named(run: Run) -> Run:
+        split = run.results.get("split") or USUAL_SPLIT
+        if split == USUAL_SPLIT or len(splits[run.scene]) < 2:
+            return run
+        return replace(run, scene=f"{run.scene} ({split})")
 
-def _split(run: Run) -> str:
-    return str(run.results.get("split") or "")
+    return [replace(each, run=named(each.run)) for each in found]
 
 
 def _size(run: Run) -> tuple[int, int]:
