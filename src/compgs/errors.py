@@ -13,7 +13,7 @@ CompGSError
 ├── CheckpointError             a run that cannot be continued
 ├── TrainingError               a training that cannot go on (no visible primitives, not-a-number loss)
 ├── ReportError                 runs that hold nothing to report on
-├── SplatFileError              a .ply, .spz, .sog, .glb or .splat file that does not hold splats, or not whole ones
+├── SplatFileError              a file of another program that does not hold splats, or not whole ones
 └── BitstreamError              the .cgs file
     ├── NotACompGSFile
     ├── UnsupportedVersion

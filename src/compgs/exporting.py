@@ -79,6 +79,7 @@ def export(
     max_splats: int | None = None,
     max_bytes: int | None = None,
     spz_version: int = 3,
+    level: int | None = None,
     overwrite: bool = False,
     device: "Device | None" = None,
     progress: Callable[[int, int], None] | None = None,
@@ -92,6 +93,7 @@ def export(
     scene's own renderings. Files of splats that nothing is asked of keep every number.
 
     `.spz` files are of version 3, or of 4, which fewer programs read and which needs the package zstandard.
+    `level` is that of a streamed .sog (`lod-meta.json`), 0 the finest.
     `progress(done, total)` counts cameras and steps.
 
     Raises ConfigError, BitstreamError, SplatFileError, OutputError, MissingDependency.
@@ -111,7 +113,7 @@ def export(
         return _export_page(source, path)
     write = functools.partial(spz.encoded, version=spz_version) if kind == "spz" else WRITERS[kind]
     chosen = chosen_device(device)
-    model = open_scene(source, chosen)
+    model = open_scene(source, chosen, level=level)
     if isinstance(model, TiledScene):
         tile = scene_file(source).parent / model.manifest.tiles[0].file
         raise SplatFileError(

@@ -123,7 +123,8 @@ class SceneFileArgument:
     """Which file, of those that hold a scene."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """A .cgs file, or splats: .ply as 3DGS writes it, .spz, .sog (or its meta.json), .glb, .splat."""
+    """A .cgs file, or splats: .ply (also SuperSplat's .compressed.ply), .spz, .sog (or its meta.json or
+    lod-meta.json), .glb, .gltf, .ksplat, .splat."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,8 +132,9 @@ class SceneFileOrRunArgument:
     """Which file; one that a run has left brings its scene along."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE|RUN")]
-    """A .cgs file, the manifest.json of a scene in tiles, or splats: .ply as 3DGS writes it, .spz, .sog (or its
-    meta.json), .glb, .splat; or the folder of a run, for its file, and its scene read as in training."""
+    """A .cgs file, the manifest.json of a scene in tiles, or splats: .ply (also SuperSplat's .compressed.ply), .spz,
+    .sog (or its meta.json or lod-meta.json), .glb, .gltf, .ksplat, .splat; or the folder of a run, for its file, and
+    its scene read as in training."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,8 +41,8 @@ class Compare(ComputingCommand, ReadingOptions, MemoryOption):
     """
 
     a: Annotated[Positional[Path], arg(metavar="A")]
-    """A .cgs file, the manifest.json of a scene in tiles, or splats: .ply as 3DGS writes it, .spz, .sog (or its
-    meta.json), .glb, .splat."""
+    """A .cgs file, the manifest.json of a scene in tiles, or splats: .ply (also SuperSplat's .compressed.ply), .spz,
+    .sog (or its meta.json or lod-meta.json), .glb, .gltf, .ksplat, .splat."""
 
     b: Annotated[Positional[Path], arg(metavar="B")]
     """Another one."""

@@ -44,7 +44,8 @@ class Compress(ComputingCommand):
     """
 
     file: Annotated[Positional[Path | None], arg(metavar="FILE", help_behavior_hint=NO_DEFAULT)] = None
-    """Splats: .ply as 3DGS writes it, .spz, .sog (or its meta.json), .glb, .splat."""
+    """Splats: .ply (also SuperSplat's .compressed.ply), .spz, .sog (or its meta.json or lod-meta.json), .glb, .gltf,
+    .ksplat, .splat."""
 
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT.cgs", help_behavior_hint=NO_DEFAULT)] = (
         None

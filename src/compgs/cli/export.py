@@ -8,6 +8,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.command import NO_DEFAULT, DecodingCommand, SceneFileArgument
 from compgs.cli.console import say
+from compgs.cli.levels import LevelOption
 from compgs.cli.progress import counting
 from compgs.cli.sizes import parse_size
 from compgs.cli.usage import check_range, settings_of_options
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(DecodingCommand, SceneFileArgument):
+class Export(DecodingCommand, SceneFileArgument, LevelOption):
     """Write a scene as plain splats (.ply, .spz, .sog, .glb), or as a web page that shows it (.html).
 
     In a .cgs file opacity and color depend on where one stands; other programs know harmonics. They are fitted
@@ -32,6 +33,8 @@ class Export(DecodingCommand, SceneFileArgument):
     compgs export garden.cgs garden.sog --max-bytes 2MB
 
     compgs export garden.ply garden.glb
+
+    compgs export city/lod-meta.json city.ply --level 2
     """
 
     output: Annotated[Positional[Path], arg(metavar="OUT")]
@@ -77,6 +80,7 @@ class Export(DecodingCommand, SceneFileArgument):
                 max_splats=self.max_splats,
                 max_bytes=most,
                 spz_version=self.spz_version,
+                level=self.level,
                 overwrite=self.overwrite,
                 device=self.device,
                 progress=progress,

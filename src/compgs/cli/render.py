@@ -11,6 +11,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from compgs.cli.command import NO_DEFAULT, DecodingCommand, MemoryOption, SceneFileOrRunArgument, SceneOptions
 from compgs.cli.console import say
+from compgs.cli.levels import LevelOption
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import RunSettings, SceneSource, file_and_run
 from compgs.cli.scenes import read_scene
@@ -35,7 +36,7 @@ VIDEO_BYTES = 16 << 20  # that must be free for a video; a long one fails later
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption):
+class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption, MemoryOption):
     """Render images or a video from a file of splats: views of a scene, cameras of a JSON file, or a way through it.
 
     A camera file is a list of objects with world_to_camera (4 x 4, OpenCV axes), fx, fy, cx, cy, width and
@@ -128,7 +129,8 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption
 
         scene = read_scene(source) if source else None
         views = self.given_views(scene)
-        model = open_scene(file, chosen_device(self.device), scene.background if scene else BLACK)
+        device, background = chosen_device(self.device), scene.background if scene else BLACK
+        model = open_scene(file, device, background, self.level)
         if self.background is not None:
             model = model.over(self.background)
         self.render(model, views or self.way(model, keyframes))

@@ -10,13 +10,14 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from compgs.cli.command import NO_DEFAULT, DecodingCommand, MemoryOption, SceneFileOrRunArgument
 from compgs.cli.console import say
+from compgs.cli.levels import LevelOption
 from compgs.cli.run_folder import file_and_run
 from compgs.cli.usage import UsageError
 from compgs.cli.viewing import check_viewing, listening
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(DecodingCommand, SceneFileOrRunArgument, MemoryOption):
+class View(DecodingCommand, SceneFileOrRunArgument, LevelOption, MemoryOption):
     """Show a file of splats in the browser: walk around in it, look behind it, record a flight.
 
     This process renders what each visitor sees, exactly: small pictures while the camera moves, one at the window's
@@ -62,7 +63,7 @@ class View(DecodingCommand, SceneFileOrRunArgument, MemoryOption):
         from compgs.viewer.shown import FileShown
         from compgs.viewer.stage import OwnThread
 
-        shown = FileShown(file, chosen_device(self.device), self.background)
+        shown = FileShown(file, chosen_device(self.device), self.background, self.level)
         with listening(shown, OwnThread(self.prepare), self.host, self.port) as viewer:
             say(f"{file}: {viewer.address}")
             if self.open:

@@ -87,7 +87,7 @@ def compress(
     device: str | None = None,
     on_progress: Callable[[TrainingStatus], None] | None = None,
 ) -> Compressed:
-    """Write splats (.ply, .spz, .splat, .sog, .glb) as a .cgs file, by training on renderings of them.
+    """Write splats (.ply, .spz, .sog or another format that is read) as a .cgs file, by training on renderings of them.
 
     Settings are those of `config`, or of a preset; of neither, those of `default` with STEPS steps. With `seconds` the
     number of steps is chosen, before the training, so that the file is there after about that long. `looking` says from

@@ -3,10 +3,13 @@
 | format | read | written | bytes a splat (degree 3) |
 |---|---|---|---|
 | .cgs | yes | by `compgs.encode` | |
-| .ply, 3DGS | yes | yes | 248 |
-| .spz 2, 3, 4 | yes | 3, 4 | about 25 |
-| .sog 2, zip or meta.json | yes | yes | about 20 |
-| .glb, KHR_gaussian_splatting | yes | yes | 240 |
+| .ply, 3DGS; 2DGS, text | yes | 3DGS | 248 |
+| .compressed.ply, SuperSplat | yes | no | 16 to 61 |
+| .spz 1 to 4 | yes | 3, 4 | about 25 |
+| .sog 1, 2, zip or meta.json | yes | 2 | about 20 |
+| lod-meta.json, .sog of several levels | yes | no | |
+| .glb, .gltf, KHR_gaussian_splatting | yes | .glb | 240 |
+| .ksplat, GaussianSplats3D | yes | no | 24 to 140, degree 2 at most |
 | .splat | yes | no | 32, no harmonics |
 | manifest.json of tiles, .cgs files | yes | by `write_tiles` | |
 | .packed, of a method of the comparison | yes | by `compgs.methods.write` | |

@@ -63,16 +63,19 @@ class Shown(Protocol):
 class FileShown:
     """A file, or a beginning of it. Raises BitstreamError, SplatFileError."""
 
-    def __init__(self, path: Path, device: str, background: Vector | None = None) -> None:
+    def __init__(
+        self, path: Path, device: str, background: Vector | None = None, level: int | None = None
+    ) -> None:
         path = self.path = scene_file(path)
         self.device = device
-        self.whole = open_scene(path, device, background or (0.0, 0.0, 0.0))
+        self.whole = open_scene(path, device, background or (0.0, 0.0, 0.0), level)
         self.background = background or self.whole.background
         self.world_offset = self.whole.world_offset
         self.up: Vector = getattr(self.whole, "up", USUAL_UP)
         self.title = scene_name(path)
         self._prefixes = _prefixes(path)
-        everything = f"all of it: {size(sum(component_bytes(path).values()))}"
+        whole = size(sum(component_bytes(path).values()))
+        everything = f"all of it: {whole}" if level is None else f"level {level}"
         self.levels = (*(words for _, words in self._prefixes), everything)
         cameras = self.whole.viewpoints
         self.cameras = tuple((f"camera {i}", camera) for i, camera in enumerate(cameras)) or (
