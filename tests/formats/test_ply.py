@@ -121,7 +121,7 @@ def without_rotation(data: bytes) -> bytes:
         (edited(b"vertex 5", b"vertex 9999999999999"), "element vertex COUNT"),
         (edited(b"vertex 5", b"vertex -5"), "element vertex COUNT"),
         (edited(b"vertex 5", b"vertex"), "element vertex COUNT"),
-        (edited(b"element vertex 5", b"element chunk 5"), "element vertex COUNT"),
+        (edited(b"element vertex 5", b"element chunk 5"), "no vertices"),
         (edited(b"element vertex 5\n", b""), "no vertices"),
         (edited(b"binary_little", b"binary_big"), "binary_little_endian"),
         (edited(b"property float f_rest_44\n", b""), "44 properties f_rest"),
@@ -280,6 +280,29 @@ def test_properties_and_elements_that_are_not_used_are_told(
     assert len(read_ply(path)) == 3
     (record,) = caplog.records
     assert record.getMessage() == f"{path}: not used: properties time, label; elements camera"
+
+
+def test_elements_before_the_vertices_are_passed_over(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+    header, rows = file.read_bytes().split(b"end_header\n", 1)
+    camera = b"element camera 2\nproperty float f\nproperty uchar kind\nelement vertex"
+    file.write_bytes(header.replace(b"element vertex", camera) + b"end_header\n" + bytes(10) + rows)
+    np.testing.assert_array_equal(read_ply(file).means, made().means)
+    assert "not used: elements camera" in caplog.text
+    file.write_bytes(file.read_bytes() + b"x")
+    with pytest.raises(SplatFileError, match="copy it again"):
+        read_ply(file)
+    listed = header.replace(b"element vertex", b"element faces 1\nproperty list uchar int v\nelement vertex")
+    file.write_bytes(listed + b"end_header\n" + bytes(1) + rows)
+    with pytest.raises(
+        SplatFileError, match="'property list uchar int v' is not a property that a splat has"
+    ):
+        read_ply(file)
+
+
+def test_a_mode_of_drawing_that_is_not_known_is_told(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file.write_bytes(with_comments(b"SplatRenderMode: 2dgs")(file.read_bytes()))
+    assert not read_ply(file).antialiased
+    assert "not used: SplatRenderMode 2dgs (drawn as plain splats)" in caplog.text
 
 
 def test_points_are_not_taken_for_splats(tmp_path: Path) -> None:

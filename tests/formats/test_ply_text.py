@@ -68,6 +68,10 @@ def test_rows_of_other_elements_are_passed_over(binary: Path, text: Path) -> Non
     )
     text.write_bytes(data + b"3 0 1 2\n")
     same(ply_text.read(text), read_ply(binary))
+    first = text_ply(binary.read_bytes())
+    first = first.replace(b"element vertex", b"element camera 2\nproperty float f\nelement vertex")
+    text.write_bytes(first.replace(b"end_header\n", b"end_header\n0.5\n0.25\n"))
+    same(ply_text.read(text), read_ply(binary))
 
 
 @pytest.mark.skipif(not CASE.is_file(), reason=f"no {CASE}")

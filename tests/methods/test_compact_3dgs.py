@@ -138,7 +138,11 @@ def test_what_holds_no_lasting_splats_is_neither_exported_nor_compressed(
             "grid: hold what is not a finite number",
         ),
         ({}, {"scale_codes": np.zeros((17, 16, 3), np.float32)}, "scale_codes: found 17 stages of 16 codes"),
-        ({}, {"rotation_codes": np.zeros((6, 16, 4), np.float32)}, "quaternion of splat 0 is zero"),
+        (
+            {},
+            {"rotation_codes": np.zeros((6, 16, 4), np.float32)},
+            "without a rotation .their quaternion is zero",
+        ),
         ({}, {"scale_codes": np.zeros((6, 9, 3), np.float32)}, "scales: expected indices of 9 entries"),
     ],
 )

@@ -16,7 +16,7 @@ antialiased; the reader takes `comment antialiased 1` (Postshot), too.
 The reader takes properties in any order; what it needs must be there, in single or double precision, and as many rows
 as the header promises. In place of f_dc it takes red, green, blue (nerfstudio), and with them `filter_3D`
 (Mip-Splatting): the width of a smoothing filter that widens a splat and dilutes its opacity. What it does not use,
-harmonics of degree 4, other properties and elements after the vertices, is named in a note. Text is read by `ply_text`,
+harmonics of degree 4, other properties and elements, is named in a note. Text is read by `ply_text`,
 SuperSplat's packed layout by `ply_compressed`.
 """
 
@@ -55,7 +55,8 @@ TYPES = {
 }
 THIRD_SCALE = "scale_2"  # which the flat splats of 2DGS lack
 _REMEDY = "export the scene again as an uncompressed 3DGS .ply"
-_ANTIALIASED = "comment SplatRenderMode: mip"
+# Of `comment SplatRenderMode`; splats of any other mode are drawn as plain ones.
+PLAIN_MODE, ANTIALIASED_MODE = "default", "mip"
 # In place of harmonics of degree 0: bytes, or numbers from 0 to 1.
 _DISPLAY_COLORS = ("red", "green", "blue")
 _BRIGHTEST = 2.0  # of colors from 0 to 1; floating-point colors above it are parts of 255
@@ -83,17 +84,27 @@ def property_groups(degree: int) -> dict[str, tuple[str, ...]]:
 
 
 @dataclass(frozen=True)
+class Before:
+    """Elements before the vertices."""
+
+    elements: int
+    bytes: int  # in a binary file
+    numbers: int  # in a file of text
+
+
+@dataclass(frozen=True)
 class PlyHeader:
     """What a file's header promises, checked against its size."""
 
     count: int  # splats
     degree: int  # of the spherical harmonics
     row: np.dtype  # of a vertex
-    start: int  # bytes before the first vertex
+    start: int  # bytes before the first vertex; of a file of text, before all elements
     bytes: int  # of the whole file
     held_degree: int  # of the harmonics in the file, which may be more than are read
-    antialiased: bool
-    elements: tuple[str, ...]  # that follow the vertices
+    mode: str  # in which the splats are drawn
+    others: tuple[str, ...]  # elements beside the vertices
+    before: Before
 
 
 # writing -----------------------------------------------------------------------------------------------------------
@@ -140,7 +151,7 @@ def ply_size(count: int, degree: int) -> int:
 
 
 def _header_text(count: int, names: list[str], *, antialiased: bool = False) -> bytes:
-    comments = [_ANTIALIASED] if antialiased else []
+    comments = [f"comment SplatRenderMode: {ANTIALIASED_MODE}"] if antialiased else []
     properties = (f"property float {name}" for name in names)
     lines = ["ply", FORMAT, *comments, f"element vertex {count}", *properties]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
@@ -193,12 +204,21 @@ def splats_of(path: Path, header: PlyHeader, table: np.ndarray) -> SplatArrays:
         opacity_logits=values(groups["opacities"])[:, 0].copy(),
         dc=_coefficients(header, values(_DISPLAY_COLORS)) if displayed else values(groups["colors"]),
         rest=np.ascontiguousarray(kept.transpose(0, 2, 1)),
-        antialiased=header.antialiased,
+        antialiased=header.mode == ANTIALIASED_MODE,
     )
     if _FILTER in held:
         found = _smoothed(found, values((_FILTER,)))
     _tell_unused(path, header)
     return drawable(path, found)
+
+
+def unknown_mode(mode: str) -> list[str]:
+    """What to tell of a mode of drawing that is not known here; nothing of one that is."""
+    return (
+        []
+        if mode in (PLAIN_MODE, ANTIALIASED_MODE)
+        else [f"SplatRenderMode {mode:.40} (drawn as plain splats)"]
+    )
 
 
 def _coefficients(header: PlyHeader, colors: np.ndarray) -> np.ndarray:
@@ -236,9 +256,10 @@ def _tell_unused(path: Path, header: PlyHeader) -> None:
     others = [name for name in header.row.names or () if name not in {*used, *_FOR_POINTS, _FILTER}]
     parts = [
         f"{kind} {', '.join(names)}"
-        for kind, names in (("properties", others), ("elements", header.elements))
+        for kind, names in (("properties", others), ("elements", header.others))
         if names
     ]
+    parts += unknown_mode(header.mode)
     if header.held_degree > header.degree:
         parts.insert(0, f"harmonics of degree {header.held_degree}")
     if parts:
@@ -265,8 +286,9 @@ def read_ply_header(path: str | Path) -> PlyHeader:
     """Everything that can be known without reading the splats. Raises SplatFileError."""
     path = Path(path)
     header = described(path, FORMAT)
+    header = replace(header, start=header.start + header.before.bytes)
     promised = header.start + header.count * header.row.itemsize
-    if header.bytes < promised or (header.bytes > promised and not header.elements):
+    if header.bytes < promised or (header.bytes > promised and len(header.others) == header.before.elements):
         raise SplatFileError(
             f"{path}: {header.count} splats of {header.row.itemsize} bytes are {promised} bytes with the header, "
             f"the file has {header.bytes}; copy it again"
@@ -277,21 +299,52 @@ def read_ply_header(path: str | Path) -> PlyHeader:
 def described(path: Path, expected: str) -> PlyHeader:
     """What a header says of splats, in a file of the format that is expected. Raises SplatFileError."""
     lines, start, size = header_lines(path)
-    count, columns, others = vertices(path, lines, expected)
-    row = np.dtype(columns)
+    elements = _elements(path, lines, expected)
+    place = next((i for i, element in enumerate(elements) if element.name == "vertex"), None)
+    if place is None:
+        raise SplatFileError(f"{path}: the header has no vertices; {_REMEDY}")
+    before, vertex = elements[:place], elements[place]
+    for element in (*before, vertex):
+        if element.other is not None:
+            raise SplatFileError(
+                f"{path}: {element.other!r} is not a property that a splat has, nor one of {element.name!r} before "
+                f"them; {_REMEDY}"
+            )
+    names = [name for name, _ in vertex.columns]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise SplatFileError(f"{path}: property {twice!r} is there twice; {_REMEDY}")
+    if vertex.count == 0:
+        raise SplatFileError(f"{path}: holds no splats")
+    row = np.dtype(vertex.columns)
     held = degree_held(path, row)
-    return PlyHeader(count, min(held, MAX_DEGREE), row, start, size, held, antialiased(lines), others)
+    others = tuple(element.name for element in elements if element is not vertex)
+    return PlyHeader(
+        vertex.count,
+        min(held, MAX_DEGREE),
+        row,
+        start,
+        size,
+        held,
+        render_mode(lines),
+        others,
+        Before(
+            len(before),
+            sum(element.bytes for element in before),
+            sum(element.count * len(element.columns) for element in before),
+        ),
+    )
 
 
-def antialiased(lines: list[list[str]]) -> bool:
-    """What comments say of how the splats are drawn; the last one counts."""
-    found = False
+def render_mode(lines: list[list[str]]) -> str:
+    """What comments say of how the splats are drawn, in Brush's words; the last one counts."""
+    found = PLAIN_MODE
     for words in lines:
         match [word.lower() for word in words]:
             case ["comment", "splatrendermode:", mode]:
-                found = mode == "mip"
+                found = mode
             case ["comment", "antialiased", ("0" | "1") as digit]:
-                found = digit == "1"
+                found = ANTIALIASED_MODE if digit == "1" else PLAIN_MODE
     return found
 
 
@@ -315,41 +368,37 @@ def header_lines(path: Path) -> tuple[list[list[str]], int, int]:
     return [line.split() for line in lines], newline + 1, size
 
 
-def vertices(
-    path: Path, lines: list[list[str]], expected: str = FORMAT
-) -> tuple[int, list[tuple[str, str]], tuple[str, ...]]:
-    """Number of vertices, names and types of their properties, and the elements that follow.
+@dataclass(frozen=True)
+class _Element:
+    """What a header says of one element."""
 
-    Raises SplatFileError for a header that says otherwise than a file of splats, or no splats.
-    """
-    count, columns, element = -1, [], ""
-    others: tuple[str, ...] = ()
+    name: str
+    count: int
+    columns: list[tuple[str, str]]  # names and types of its properties
+    other: str | None  # the first line of it that is no such property
+
+    @property
+    def bytes(self) -> int:
+        return self.count * sum(np.dtype(kind).itemsize for _, kind in self.columns)
+
+
+def _elements(path: Path, lines: list[list[str]], expected: str) -> list[_Element]:
+    """In the order of the file. Raises SplatFileError for another format than the expected one."""
+    found: list[_Element] = []
     for words in lines[1:]:
-        if words[:1] == ["format"] and " ".join(words) != expected:
-            raise SplatFileError(f"{path}: expected {expected!r}, found {' '.join(words)!r}; {_REMEDY}")
+        text = " ".join(words)
+        if words[:1] == ["format"] and text != expected:
+            raise SplatFileError(f"{path}: expected {expected!r}, found {text!r}; {_REMEDY}")
         if words[:1] == ["element"]:
-            element = words[1] if len(words) == 3 else ""
-            if count < 0 and not (element == "vertex" and words[2].isdecimal() and len(words[2]) <= 12):
-                raise SplatFileError(
-                    f"{path}: expected 'element vertex COUNT' first, found {' '.join(words)!r}; {_REMEDY}"
-                )
-            others += () if element == "vertex" else (element,)
-            count = int(words[2]) if count < 0 else count
-        elif words[:1] == ["property"] and element == "vertex":
-            if len(words) != 3 or words[1] not in TYPES:
-                raise SplatFileError(
-                    f"{path}: {' '.join(words)!r} is not a property that a splat has; {_REMEDY}"
-                )
-            columns.append((words[2], TYPES[words[1]]))
-    names = [name for name, _ in columns]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise SplatFileError(f"{path}: property {twice!r} is there twice; {_REMEDY}")
-    if count < 0:
-        raise SplatFileError(f"{path}: the header has no vertices; {_REMEDY}")
-    if count == 0:
-        raise SplatFileError(f"{path}: holds no splats")
-    return count, columns, others
+            if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 12:
+                raise SplatFileError(f"{path}: expected 'element vertex COUNT', found {text!r}; {_REMEDY}")
+            found.append(_Element(words[1], int(words[2]), [], None))
+        elif words[:1] == ["property"] and found:
+            if len(words) == 3 and words[1] in TYPES:
+                found[-1].columns.append((words[2], TYPES[words[1]]))
+            elif found[-1].other is None:
+                found[-1] = replace(found[-1], other=text)
+    return found
 
 
 def degree_held(path: Path, row: np.dtype) -> int:

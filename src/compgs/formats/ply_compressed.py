@@ -151,7 +151,9 @@ def _layout(path: Path) -> Layout:
         for name in rows[element].names or ()
         if name not in names
     ]
-    return Layout(count, degree, rows, starts, size, ply.antialiased(lines), tuple(unused))
+    mode = ply.render_mode(lines)
+    unused += ply.unknown_mode(mode)
+    return Layout(count, degree, rows, starts, size, mode == ply.ANTIALIASED_MODE, tuple(unused))
 
 
 def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[tuple[str, str]]]]:

@@ -28,11 +28,12 @@ def read(path: Path) -> SplatArrays:
     """Raises SplatFileError."""
     header = _header(path)
     names = header.row.names or ()
-    numbers = np.empty(header.count * len(names), np.float32)
+    before = header.before.numbers
+    numbers = np.empty(before + header.count * len(names), np.float32)
     with open(path, "rb") as file:
         file.seek(header.start)
-        _fill(numbers, path, file, names)
-    table = numbers.view([(name, np.float32) for name in names])
+        _fill(numbers, path, file, names, before)
+    table = numbers[before:].view([(name, np.float32) for name in names])
     return ply.splats_of(path, header, table)
 
 
@@ -46,7 +47,7 @@ def _header(path: Path) -> ply.PlyHeader:
     """Checked against the size of the file."""
     header = ply.described(path, FORMAT)
     count, size, width = header.count, header.bytes - header.start, len(header.row.names or ())
-    least = _LEAST_BYTES * count * width - 1  # nothing need follow the last number
+    least = _LEAST_BYTES * (header.before.numbers + count * width) - 1  # nothing need follow the last number
     if size < least:
         raise SplatFileError(
             f"{path}: {count} splats of {width} numbers are at least {least} bytes of text, the file has {size}; "
@@ -55,8 +56,11 @@ def _header(path: Path) -> ply.PlyHeader:
     return header
 
 
-def _fill(numbers: np.ndarray, path: Path, file: BinaryIO, names: tuple[str, ...]) -> None:
-    """With the first numbers of a text; what follows them belongs to other elements. Raises SplatFileError."""
+def _fill(numbers: np.ndarray, path: Path, file: BinaryIO, names: tuple[str, ...], before: int) -> None:
+    """With the first numbers of a text, `before` the first of a splat; what follows them belongs to other elements.
+
+    Raises SplatFileError.
+    """
     done, cut = 0, b""
     while done < len(numbers):
         block = file.read(_BLOCK)
@@ -69,12 +73,15 @@ def _fill(numbers: np.ndarray, path: Path, file: BinaryIO, names: tuple[str, ...
             )
         words = words[: len(numbers) - done]
         with np.errstate(over="ignore"):  # what is too large becomes infinite, as in a binary file
-            numbers[done : done + len(words)] = _parsed(path, words, done, names)
+            numbers[done : done + len(words)] = _parsed(path, words, done - before, names)
         done += len(words)
 
 
 def _parsed(path: Path, words: list[bytes], first: int, names: tuple[str, ...]) -> np.ndarray:
-    """[len(words)] float64. Raises SplatFileError, naming the first word that is no number."""
+    """[len(words)] float64; `first` counts from the first number of a splat.
+
+    Raises SplatFileError, naming the first word that is no number.
+    """
     try:
         return np.fromiter(map(float, words), np.float64, len(words))
     except ValueError:
@@ -83,8 +90,9 @@ def _parsed(path: Path, words: list[bytes], first: int, names: tuple[str, ...]) 
                 float(word)
             except ValueError:
                 splat, column = divmod(i, len(names))
+                what = f"{names[column]} of splat {splat}" if i >= 0 else "a number before the splats"
                 found = word[:20].decode("ascii", errors="replace")
                 raise SplatFileError(
-                    f"{path}: {names[column]} of splat {splat} is {found!r}, expected a number; copy it again"
+                    f"{path}: {what} is {found!r}, expected a number; copy it again"
                 ) from None
         raise
