@@ -81,14 +81,17 @@ def test_splats_that_another_format_cannot_hold_are_compressed_all_the_same(
     assert written["notes"] == [note] and [each["format"] for each in written["others"]] == ["sog"]
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
 def test_what_is_trained_on_are_renderings_of_the_splats(
-    ball_ply: Path, config: Config, tmp_path: Path
+    ball_ply: Path, config: Config, tmp_path: Path, antialiased: bool
 ) -> None:
     looking = replace(LOOKING, views=4, held_out=2, background=(0.2, 0.5, 0.9))
-    begun = begin(ball_ply, tmp_path / "out.cgs", config, looking)
+    source = tmp_path / "source.ply"
+    write_ply(replace(open_scene(ball_ply).splats, antialiased=antialiased), source)
+    begun = begin(source, tmp_path / "out.cgs", config, looking)
     scene = begun.scene
     assert (len(scene.train_views), len(scene.test_views)) == (4, 2)
-    settings = RasterSettings(background=looking.background)
+    settings = RasterSettings(background=looking.background, antialiased=antialiased)
     for view in (scene.train_views[1], scene.test_views[0]):
         arrays = vars(begun.splats.gaussians(view.camera)).values()
         gaussians = Gaussians(*map(torch.from_numpy, arrays))

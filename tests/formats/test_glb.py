@@ -165,6 +165,7 @@ def test_columns_of_smaller_integers_and_rows_with_room_are_read(made, tmp_path:
         "type": "SCALAR",
         "byteOffset": 8,
     }
+    gltf["extensionsRequired"] = ["KHR_gaussian_splatting", "KHR_mesh_quantization"]
     path = tmp_path / "a.glb"
     path.write_bytes(put_together(gltf, binary + rows.tobytes()))
     found = glb.read(path)

@@ -123,7 +123,7 @@ def without_rotation(data: bytes) -> bytes:
         (edited(b"vertex 5", b"vertex"), "element vertex COUNT"),
         (edited(b"element vertex 5", b"element chunk 5"), "no vertices"),
         (edited(b"element vertex 5\n", b""), "no vertices"),
-        (edited(b"binary_little", b"binary_big"), "binary_little_endian"),
+        (edited(b"binary_little", b"binary_middle"), "binary_little_endian"),
         (edited(b"property float f_rest_44\n", b""), "44 properties f_rest"),
         (edited(b"f_rest_44", b"f_rest_45"), "'f_rest_44' is missing"),
         (edited(b"float opacity", b"float transparency"), "'opacity' is missing"),
@@ -297,6 +297,14 @@ def test_elements_before_the_vertices_are_passed_over(file: Path, caplog: pytest
         SplatFileError, match="'property list uchar int v' is not a property that a splat has"
     ):
         read_ply(file)
+
+
+def test_big_endian_numbers_are_read(file: Path) -> None:
+    header, rows = file.read_bytes().split(b"end_header\n", 1)
+    swapped = np.frombuffer(rows, "<f4").astype(">f4").tobytes()
+    file.write_bytes(header.replace(b"little", b"big") + b"end_header\n" + swapped)
+    for name, column in made().columns.items():
+        np.testing.assert_array_equal(read_ply(file).columns[name], column)
 
 
 def test_a_mode_of_drawing_that_is_not_known_is_told(file: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -235,6 +235,10 @@ def at(position: int, value: bytes) -> Callable[[bytes], bytes]:
         (unpacked(at(12, b"\x05")), "degree 5"),
         (unpacked(at(13, b"\x19")), "25 fractional bits"),
         (unpacked(lambda data: data + bytes(1 << 16)), "the file holds more than"),
+        (
+            unpacked(lambda data: at(14, b"\x80")(data) + bytes(80)),
+            "its flags 0x80 are not known here: export it as",
+        ),
     ],
 )
 def test_a_damaged_file_is_refused_with_what_is_wrong(

@@ -56,7 +56,9 @@ _PARTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _DEEPEST = 64  # nodes inside nodes
 _EVEN = 1e-4  # relative difference of lengths that is rounding
 _MOST_PLACEMENTS = 4096  # of splats by nodes
-_INSTANCES = "EXT_mesh_gpu_instancing"
+_INSTANCES, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
+# That a file may require: attributes of integers are read without it.
+_KNOWN_EXTENSIONS = {EXTENSION, _VISIBILITY, "KHR_mesh_quantization"}
 # Of the extension: what is drawn here. Who does not know another may ignore it.
 _HINTS = {"kernel": "ellipse", "projection": "perspective", "sortingMethod": "cameraDistance"}
 
@@ -293,7 +295,7 @@ def _find_splats(
     path: Path, gltf: dict[str, Any]
 ) -> tuple[tuple[dict[str, int], ...], tuple[Placement, ...]]:
     """Every primitive of splats, and each place that the scene gives it."""
-    foreign = sorted(set(gltf.get("extensionsRequired", [])) - {EXTENSION})
+    foreign = sorted(set(gltf.get("extensionsRequired", [])) - _KNOWN_EXTENSIONS)
     if foreign:
         raise SplatFileError(f"{path}: needs the extension {foreign[0]}, which is not read here")
     primitives: list[dict[str, int]] = []
@@ -367,7 +369,7 @@ def _places(path: Path, gltf: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]
         visited.add(index)
         node = nodes[index]
         extensions = node.get("extensions", {})
-        if extensions.get("KHR_node_visibility", {}).get("visible", True) is False:
+        if extensions.get(_VISIBILITY, {}).get("visible", True) is False:
             continue
         here = above @ _node_matrix(node)
         if "mesh" in node:

@@ -10,8 +10,8 @@
 | scale_0 ... 2 | log of the standard deviations, world units; 2DGS has two, its splats are flat |
 | rot_0 ... 3 | quaternion w-x-y-z, not normalized |
 
-Little endian, in this order. `comment SplatRenderMode: mip` in the header (Brush) says that the splats are
-antialiased; the reader takes `comment antialiased 1` (Postshot), too.
+Little endian, in this order; the reader takes big endian, too. `comment SplatRenderMode: mip` in the header (Brush)
+says that the splats are antialiased; the reader takes `comment antialiased 1` (Postshot), too.
 
 The reader takes properties in any order; what it needs must be there, in single or double precision, and as many rows
 as the header promises. In place of f_dc it takes red, green, blue (nerfstudio), and with them `filter_3D`
@@ -43,6 +43,7 @@ from compgs.outputs import check_output_file, write_bytes
 
 MAX_HEADER_BYTES = 1 << 16
 FORMAT = "format binary_little_endian 1.0"
+BIG_ENDIAN = "format binary_big_endian 1.0"  # is read, too
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -285,7 +286,7 @@ def component_bytes_of(header: PlyHeader) -> dict[str, int]:
 def read_ply_header(path: str | Path) -> PlyHeader:
     """Everything that can be known without reading the splats. Raises SplatFileError."""
     path = Path(path)
-    header = described(path, FORMAT)
+    header = described(path, FORMAT, BIG_ENDIAN)
     header = replace(header, start=header.start + header.before.bytes)
     promised = header.start + header.count * header.row.itemsize
     if header.bytes < promised or (header.bytes > promised and len(header.others) == header.before.elements):
@@ -296,8 +297,8 @@ def read_ply_header(path: str | Path) -> PlyHeader:
     return header
 
 
-def described(path: Path, expected: str) -> PlyHeader:
-    """What a header says of splats, in a file of the format that is expected. Raises SplatFileError."""
+def described(path: Path, *expected: str) -> PlyHeader:
+    """What a header says of splats, in a file of one of the formats that are expected. Raises SplatFileError."""
     lines, start, size = header_lines(path)
     elements = _elements(path, lines, expected)
     place = next((i for i, element in enumerate(elements) if element.name == "vertex"), None)
@@ -317,6 +318,8 @@ def described(path: Path, expected: str) -> PlyHeader:
     if vertex.count == 0:
         raise SplatFileError(f"{path}: holds no splats")
     row = np.dtype(vertex.columns)
+    if BIG_ENDIAN.split() in lines:
+        row = row.newbyteorder(">")
     held = degree_held(path, row)
     others = tuple(element.name for element in elements if element is not vertex)
     return PlyHeader(
@@ -382,13 +385,13 @@ class _Element:
         return self.count * sum(np.dtype(kind).itemsize for _, kind in self.columns)
 
 
-def _elements(path: Path, lines: list[list[str]], expected: str) -> list[_Element]:
-    """In the order of the file. Raises SplatFileError for another format than the expected one."""
+def _elements(path: Path, lines: list[list[str]], expected: tuple[str, ...]) -> list[_Element]:
+    """In the order of the file. Raises SplatFileError for another format than those that are expected."""
     found: list[_Element] = []
     for words in lines[1:]:
         text = " ".join(words)
-        if words[:1] == ["format"] and text != expected:
-            raise SplatFileError(f"{path}: expected {expected!r}, found {text!r}; {_REMEDY}")
+        if words[:1] == ["format"] and text not in expected:
+            raise SplatFileError(f"{path}: expected {expected[0]!r}, found {text!r}; {_REMEDY}")
         if words[:1] == ["element"]:
             if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 12:
                 raise SplatFileError(f"{path}: expected 'element vertex COUNT', found {text!r}; {_REMEDY}")

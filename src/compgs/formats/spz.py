@@ -62,6 +62,7 @@ GZIP_MAGIC = b"\x1f\x8b"
 VERSIONS = (1, 2, 3, 4)
 WRITTEN_VERSIONS = (3, 4)
 ANTIALIASED, HAS_EXTENSIONS = 1, 2  # flags
+KNOWN_FLAGS = ANTIALIASED | HAS_EXTENSIONS
 COORDINATE_SYSTEM = 0xADBE0003  # an extension
 # By its value: where x, y and z point to.
 AXES = (
@@ -301,7 +302,7 @@ def _axes(path: Path, header: SpzHeader, records: bytes) -> str:
     axes, passed_over = USUAL_AXES, []
     if header.degree > MAX_DEGREE:
         passed_over.append(f"harmonics of degree {header.degree}")
-    if unknown := header.flags & ~(ANTIALIASED | HAS_EXTENSIONS):
+    if unknown := header.flags & ~KNOWN_FLAGS:
         passed_over.append(f"flags {unknown:#x}")
     for kind, content in _extensions(path, records):
         if kind != COORDINATE_SYSTEM:
@@ -385,8 +386,14 @@ def _gzip_columns(path: Path, header: SpzHeader, data: bytes) -> tuple[list[byte
         end, after = unpacker.eof, unpacker.unused_data
     if len(content) < promised or len(content) > most:
         found = f"more than {most}" if len(content) > most else str(len(content))
+        unknown = header.flags & ~KNOWN_FLAGS
+        remedy = (
+            f"its flags {unknown:#x} are not known here: export it as plain splats"
+            if unknown
+            else "copy it again"
+        )
         raise SplatFileError(
-            f"{path}: {header.count} splats are {promised} bytes unpacked, the file holds {found}; copy it again"
+            f"{path}: {header.count} splats are {promised} bytes unpacked, the file holds {found}; {remedy}"
         )
     if not end:
         raise SplatFileError(f"{path}: its compressed data have no end; copy it again")
