@@ -67,9 +67,9 @@ def judged(camera: Camera) -> Camera:
 
 
 def random_signs(seed: int, shape: tuple[int, ...], device: torch.device) -> Tensor:
-    """-1 or 1, float32."""
-    chance = torch.Generator(device).manual_seed(seed)
-    return torch.randint(0, 2, shape, generator=chance, device=device).float() * 2.0 - 1.0
+    """-1 or 1, float32; drawn on the CPU, so that a pruning takes the same anchors on every device."""
+    chance = torch.Generator().manual_seed(seed)
+    return (torch.randint(0, 2, shape, generator=chance).float() * 2.0 - 1.0).to(device)
 
 
 def bit_price(lmbda: float, anchors: int) -> float:
