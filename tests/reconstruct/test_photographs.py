@@ -8,7 +8,12 @@ from PIL import Image
 
 from compgs.errors import SceneError, UnreadableImage
 from compgs.reconstruct.cameras import lens_model, shared_camera
-from compgs.reconstruct.photographs import find_photographs, holds_photographs, store_upright
+from compgs.reconstruct.photographs import (
+    find_photographs,
+    holds_photographs,
+    store_masks,
+    store_upright,
+)
 
 MAKE, MODEL, FOCAL_35 = 0x010F, 0x0110, 0xA405
 
@@ -74,6 +79,54 @@ def test_formats_that_scenes_do_not_keep_become_png_with_the_same_pixels(tmp_pat
     store_upright(find_photographs(source), tmp_path / "images")
     with Image.open(tmp_path / "images" / "odd.png") as image:
         assert image.format == "PNG" and np.array_equal(np.asarray(image), np.asarray(picture()))
+
+
+@pytest.mark.parametrize(
+    ("pixels", "level"),
+    [
+        (np.full((16, 24), 0.5, np.float32), 128),
+        (np.full((16, 24), 32896, np.uint16), 128),
+        (np.full((16, 24, 4), 0, np.uint8), 255),  # as CMYK: no ink
+    ],
+)
+def test_samples_that_png_does_not_have_become_8_bits(tmp_path: Path, pixels: np.ndarray, level: int) -> None:
+    source = three(tmp_path / "photos")
+    image = Image.fromarray(pixels, mode="CMYK") if pixels.ndim == 3 else Image.fromarray(pixels)
+    image.save(source / "odd.tif")
+    store_upright(find_photographs(source), tmp_path / "images")
+    stored = np.asarray(Image.open(tmp_path / "images" / "odd.png"))
+    assert stored.dtype == np.uint8 and stored.shape == (16, 24, 3) and (stored == level).all()
+
+
+@pytest.mark.parametrize("suffix", ["tif", "png"])
+def test_samples_of_which_white_is_not_known_are_refused_before_poses_are_sought(
+    tmp_path: Path, suffix: str
+) -> None:
+    source = three(tmp_path / "photos")
+    Image.fromarray(np.full((16, 24), 4095, np.uint16)).save(source / f"odd.{suffix}")
+    with pytest.raises(UnreadableImage, match=rf"odd\.{suffix}: samples of 16 bits.*convert"):
+        find_photographs(source)
+
+
+@pytest.mark.parametrize("name", ["masks/p1.jpg.png", "masks/p1.png", "p1.jpg.mask.png", "p1_mask.png"])
+@pytest.mark.parametrize(
+    "drawn", ["on the picture as stored", "on the upright picture", "with a tag of its own"]
+)
+def test_masks_are_no_photographs_and_come_along_upright(tmp_path: Path, name: str, drawn: str) -> None:
+    source = three(tmp_path / "photos")
+    upright = np.zeros((24, 16), np.uint8)
+    upright[:3, :5] = 255
+    save(source / "p1.jpg", picture(), orientation=6)
+    mask = Image.fromarray(upright)
+    if drawn != "on the upright picture":
+        mask = mask.transpose(Image.Transpose.ROTATE_90)  # undoes what the tag 6 asks for
+    save(source / name, mask, **({"orientation": 6} if drawn == "with a tag of its own" else {}))
+    photographs = find_photographs(source)
+    assert [photograph.name for photograph in photographs] == ["p0.jpg", "p1.jpg", "p2.jpg"]
+    assert store_masks(photographs, tmp_path / "masks") == 1
+    (stored,) = (tmp_path / "masks").iterdir()
+    assert stored.name == "p1.jpg.png"
+    np.testing.assert_array_equal(np.asarray(Image.open(stored)), upright)
 
 
 def test_folders_inside_count_and_hidden_files_do_not(tmp_path: Path) -> None:

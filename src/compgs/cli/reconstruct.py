@@ -111,6 +111,12 @@ def show(result: "Reconstruction") -> None:
         f"{result.points:,} points, reprojection error {result.reprojection_error:.2f} pixels"
     )
     say(f"{result.lens}, {result.matching} matching; {times}")
+    if result.masks and result.masks_kept:
+        say(
+            f"masks of {result.masks} photographs are in {result.scene / 'masks'}; poses were found without them"
+        )
+    elif result.masks:
+        say(f"note: masks of {result.masks} photographs are left out: --undistort makes other pixels")
     if result.missing:
         names = ", ".join(result.missing[:MOST_NAMES]) + (", ..." if len(result.missing) > MOST_NAMES else "")
         say(f"note: without a pose: {names}")

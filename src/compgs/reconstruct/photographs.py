@@ -3,18 +3,22 @@
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from PIL import ExifTags, Image, ImageOps
 
 from compgs.errors import SceneError, UnreadableImage
 from compgs.scene.images import DAMAGED, open_image
+from compgs.scene.masks import FOLDER, find_mask, mask_beside
+from compgs.scene.names import Names
+from compgs.scene.pixels import UnusableSamples, is_wide, rgb
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 KEPT = (".jpg", ".jpeg", ".png")  # all others become .png, which every reader of a scene opens
 HEIC = (".heic", ".heif")
 JPEG_QUALITY = 95  # of photographs that must be turned, and so encoded again
+PNG_MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
 ROTATED = 0x0112  # the tag of the orientation; 1: upright
 
 
@@ -27,6 +31,7 @@ class Photograph:
     size: tuple[int, int]  # (width, height) in pixels, upright
     upright: bool  # as stored; else its orientation tag asks for a turn
     camera: tuple[str, ...]  # maker, model, lens and focal length, as far as they are known
+    mask: Path | None = None  # file that says which of its pixels count, found beside the photographs
 
 
 def holds_photographs(folder: Path) -> bool:
@@ -41,7 +46,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
     """
     if not folder.is_dir():
         raise SceneError(f"{folder}: expected a folder of photographs, or a video, found nothing there")
-    paths = sorted(path for path in _files(folder) if path.suffix.lower() in SUFFIXES)
+    paths, masks = _without_masks(folder)
     if len(paths) < 3:
         heic = sum(path.suffix.lower() in HEIC for path in _files(folder))
         found = f"{len(paths)} photographs ({', '.join(s[1:] for s in SUFFIXES)})"
@@ -49,7 +54,7 @@ def find_photographs(folder: Path) -> list[Photograph]:
             f"{folder}: {found}; poses can be found from 3 on, and some 30 are needed to see a scene from all sides"
             + (f". {heic} HEIC files are not read: convert them, e.g. with heif-convert" if heic else "")
         )
-    photographs = [_photograph(path, folder) for path in paths]
+    photographs = [replace(_photograph(path, folder), mask=masks.get(path)) for path in paths]
     names: dict[str, Path] = {}
     for photograph in photographs:
         other = names.setdefault(photograph.name, photograph.path)
@@ -69,6 +74,50 @@ def store_upright(photographs: Sequence[Photograph], folder: Path) -> None:
             shutil.copyfile(photograph.path, target)
         else:
             _store_turned(photograph.path, target)
+
+
+def store_masks(photographs: Sequence[Photograph], folder: Path) -> int:
+    """Writes the masks of photographs to `folder`, upright as those are, as scenes have them; how many there are.
+
+    Raises UnreadableImage.
+    """
+    masked = [photograph for photograph in photographs if photograph.mask is not None]
+    for photograph in masked:
+        target = folder / f"{photograph.name}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        assert photograph.mask is not None
+        try:
+            with open_image(photograph.mask) as mask, open_image(photograph.path) as image:
+                own, stored = mask.getexif().get(ROTATED, 1), image.getexif().get(ROTATED, 1)
+                # Without a tag of its own, a mask of the stored picture's size was drawn on that.
+                _turned(mask, stored if own == 1 and mask.size == image.size else own).save(
+                    target, format="PNG"
+                )
+        except DAMAGED as error:
+            raise UnreadableImage(
+                f"{photograph.mask}: the mask cannot be read ({error}); remove it or save it again"
+            ) from error
+    return len(masked)
+
+
+def _without_masks(folder: Path) -> tuple[list[Path], dict[Path, Path]]:
+    """Photographs by path, and the masks of those that have one: in a folder `masks`, or beside them by name."""
+    paths = sorted(path for path in _files(folder) if path.suffix.lower() in SUFFIXES)
+    places = {
+        path
+        for path in paths
+        if path.relative_to(folder).parts[0].lower() == FOLDER and path.parent != folder
+    }
+    names, masks = Names(), dict[Path, Path]()
+    for path in paths:
+        mask = mask_beside(path, names)
+        if mask is None and places:
+            inside = folder / next(iter(places)).relative_to(folder).parts[0]
+            mask = find_mask(inside, path.relative_to(folder).as_posix(), names)
+        if mask is not None and path not in places:
+            masks[path] = mask
+    left_out = places | set(masks.values())
+    return [path for path in paths if path not in left_out], masks
 
 
 def _files(folder: Path) -> list[Path]:
@@ -91,6 +140,10 @@ def _photograph(path: Path, folder: Path) -> Photograph:
         with open_image(path) as image:
             exif = image.getexif()
             width, height = image.size
+            if image.mode not in PNG_MODES or is_wide(image):
+                _storable(image)
+    except UnusableSamples as error:
+        raise UnreadableImage(f"{path}: {error}") from error
     except DAMAGED as error:
         raise UnreadableImage(f"{path}: cannot be read ({error}); remove it or save it again") from error
     orientation = exif.get(ROTATED, 1)
@@ -106,11 +159,29 @@ def _camera(exif: Image.Exif) -> tuple[str, ...]:
 
 
 def _store_turned(source: Path, target: Path) -> None:
-    with open_image(source) as image:
-        turned = ImageOps.exif_transpose(image)
-        exif = turned.getexif()
-        exif.pop(ROTATED, None)  # the rest stays: the focal length is in it
-        if target.suffix.lower() == ".png":
-            turned.save(target, format="PNG", exif=exif)
-        else:
-            turned.convert("RGB").save(target, format="JPEG", quality=JPEG_QUALITY, subsampling=0, exif=exif)
+    try:
+        with open_image(source) as image:
+            exif = image.getexif()
+            turned = _turned(_storable(image), exif.get(ROTATED, 1))
+    except UnusableSamples as error:
+        raise UnreadableImage(f"{source}: {error}") from error
+    exif.pop(ROTATED, None)  # the rest stays: the focal length is in it
+    if target.suffix.lower() == ".png":
+        turned.save(target, format="PNG", exif=exif)
+    else:
+        turned.convert("RGB").save(target, format="JPEG", quality=JPEG_QUALITY, subsampling=0, exif=exif)
+
+
+def _storable(image: Image.Image) -> Image.Image:
+    """The image, in 8 bits where its samples are of a type that PNG does not have. Raises UnusableSamples."""
+    wide = is_wide(image)
+    image.load()
+    if image.mode in PNG_MODES and not wide:
+        return image
+    return Image.fromarray(rgb(image, (0.0, 0.0, 0.0), wide=wide)[0])
+
+
+def _turned(image: Image.Image, orientation: int) -> Image.Image:
+    """As an orientation tag asks for."""
+    image.getexif()[ROTATED] = orientation
+    return ImageOps.exif_transpose(image)

@@ -15,9 +15,16 @@ from compgs.outputs import check_output_folder, write_json
 from compgs.reconstruct import video
 from compgs.reconstruct.cameras import SharedCamera, lens_model, shared_camera
 from compgs.reconstruct.mapping import Job, Progress, Stage, check_colmap, run_colmap, undistort_images
-from compgs.reconstruct.photographs import JPEG_QUALITY, Photograph, find_photographs, store_upright
+from compgs.reconstruct.photographs import (
+    JPEG_QUALITY,
+    Photograph,
+    find_photographs,
+    store_masks,
+    store_upright,
+)
 from compgs.reconstruct.report import picture, summary
 from compgs.scene.colmap import SparseModel, read_sparse_model
+from compgs.scene.masks import FOLDER as MASKS
 
 # Photographs up to which each is compared with each: 44 850 pairs, some hours on two cores.
 EXHAUSTIVE_UP_TO = 300
@@ -57,6 +64,8 @@ class Reconstruction:
     lens: str
     matching: str
     seconds: dict[str, float]  # by stage
+    masks: int = 0  # found, of which photographs have one
+    masks_kept: bool = True  # in the scene; undistorted photographs have other pixels than their masks
 
 
 def reconstruct(
@@ -101,7 +110,11 @@ def _reconstruct(
         raise SceneError(
             f"{source}: expected a folder of photographs, or a video ({', '.join(video.SUFFIXES)})"
         )
-    photographs = _video_frames(source, images, options.frames) if ordered else _stored(source, images)
+    photographs = (
+        _video_frames(source, images, options.frames)
+        if ordered
+        else _stored(source, images, masks=not options.undistort)
+    )
     shared = shared_camera(photographs) if options.shared == "auto" else options.shared
     many = len(photographs) > EXHAUSTIVE_UP_TO
     matching = options.matching
@@ -144,6 +157,8 @@ def _reconstruct(
         lens="PINHOLE" if options.undistort else job.lens,
         matching=job.matching,
         seconds=seconds,
+        masks=sum(photograph.mask is not None for photograph in photographs),
+        masks_kept=not options.undistort,
     )
     write_json(target / "reconstruction.json", summary(result, model))
     picture(model).save(target / "reconstruction.png")
@@ -158,9 +173,11 @@ def _check(options: ReconstructOptions) -> None:
             raise ConfigError(f"{name} {getattr(options, name)}: expected {low} or more")
 
 
-def _stored(folder: Path, images: Path) -> list[Photograph]:
+def _stored(folder: Path, images: Path, *, masks: bool) -> list[Photograph]:
     photographs = find_photographs(folder)
     store_upright(photographs, images)
+    if masks:
+        store_masks(photographs, images.with_name(MASKS))
     return photographs
 
 
