@@ -30,6 +30,7 @@ def folder(tmp_path: Path) -> Path:
         ("cam 0/frame.0001", "cam 0/frame.0001.png"),
         ("both", "both.png"),
         ("both.jpg", "both.jpg"),
+        ("cam 0/b (1).png", "cam 0/b (1).JPG"),
         (unicodedata.normalize("NFC", "x/é.png"), unicodedata.normalize("NFD", "x/é.png")),
         (unicodedata.normalize("NFC", "X/É"), unicodedata.normalize("NFD", "x/é.png")),
     ],
@@ -38,7 +39,9 @@ def test_names_of_other_programs_mean_the_file_that_is_there(folder: Path, name:
     assert Names().find(folder, name) == folder / found
 
 
-@pytest.mark.parametrize("name", ["b.png", "cam 0/frame.0002", "cam 0", "", ".", "x/../a", "../a", "/a"])
+@pytest.mark.parametrize(
+    "name", ["b.png", "cam 0/frame.0002.png", "cam 0/frame.0002", "cam 0", "", ".", "x/../a", "../a", "/a"]
+)
 def test_other_names_mean_none(folder: Path, name: str) -> None:
     assert Names().find(folder / "x" if name == "../a" else folder, name) is None
 
@@ -52,7 +55,9 @@ def test_the_file_that_is_spelled_so_goes_before_one_in_other_letter_case(tmp_pa
         tmp_path / "a.png",
         tmp_path / "A.png",
     ]
-    assert Names().find(tmp_path, "a.PNG") is None  # of two, none is meant
+    for name in ("b.x", "B.x"):
+        (tmp_path / name).touch()
+    assert Names().find(tmp_path, "b.X") is None  # of two, none is meant
 
 
 def test_lists_of_names_are_read_as_tolerantly() -> None:

@@ -468,3 +468,63 @@ def test_poses_that_lie_deeper_are_found_for_the_message(write_capture: Write) -
     deep = write_capture(folder="deep/inside")
     with pytest.raises(MissingSparseModel, match=r"some in inside/"):
         load_scene(deep.parent)
+
+
+@pytest.mark.parametrize(
+    ("name", "program"),
+    [
+        ("poses_bounds.npy", "LLFF"),
+        ("garden.nvm", "VisualSFM"),
+        ("cameras.xml", "Metashape"),
+        ("images/00.xmp", "RealityScan"),
+        ("cameras.sfm", "Meshroom"),
+        ("bundle.out", "Bundler"),
+    ],
+)
+def test_poses_that_are_not_read_are_named_with_their_program(
+    tmp_path: Path, name: str, program: str
+) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / name).touch()
+    with pytest.raises(
+        MissingSparseModel, match=rf"{name} is not read: poses of {program}.*transforms\.json"
+    ):
+        load_scene(tmp_path)
+
+
+def test_features_without_poses_are_named_with_the_program_that_finds_them(tmp_path: Path) -> None:
+    (tmp_path / "database.db").touch()
+    with pytest.raises(
+        MissingSparseModel, match=r"database\.db has COLMAP's features.*colmap mapper.*reconstruct"
+    ):
+        load_scene(tmp_path)
+
+
+def test_photographs_that_were_converted_are_found_and_said(write_capture: Write) -> None:
+    folder = write_capture([f"{i}.jpg" for i in range(5)])
+    for path in sorted((folder / "images").iterdir()):
+        Image.open(path).save(path.with_suffix(".png"))
+        path.unlink()
+    scene = load_scene(folder)
+    assert names(all_views(scene)) == [f"{i}.jpg" for i in range(5)]
+    assert scene.notes == ("5 photographs have another suffix than in the poses, such as 0.png for 0.jpg",)
+
+
+def test_photographs_in_another_folder_are_named_with_the_option(write_capture: Write) -> None:
+    folder = write_capture()
+    (folder / "images").rename(folder / "photos")
+    with pytest.raises(UnreadableImage, match=r"00\.png: .*photos/ has one of that name: .*images=\.\.\."):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_without_a_size_the_principal_point_tells_how_a_photograph_is_turned(
+    write_frames: Callable, upright: bool
+) -> None:
+    folder = write_frames({"fl_x": 50, "cx": 24, "cy": 32} if upright else {"fl_x": 50, "cx": 32, "cy": 24})
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for path in (folder / "images").iterdir():
+        Image.open(path).save(path, exif=exif)
+    view = load_scene(folder).train_views[0]
+    assert view.image.shape == ((WIDTH, HEIGHT, 3) if upright else (HEIGHT, WIDTH, 3))

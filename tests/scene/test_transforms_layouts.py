@@ -249,7 +249,9 @@ def test_scaled_poses_keep_their_position(nerfstudio: Callable[..., Path]) -> No
 
 
 @pytest.mark.parametrize("layout", ["blender", "nerfstudio"])
-@pytest.mark.parametrize("name", ["../elsewhere.png", "/elsewhere.png", "images/../../elsewhere.png"])
+@pytest.mark.parametrize(
+    "name", ["../elsewhere.png", "/elsewhere.png", "images/../../elsewhere.png", "C:\\elsewhere.png"]
+)
 def test_images_outside_of_the_scene_are_refused_before_they_are_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str, name: str
 ) -> None:
@@ -260,8 +262,10 @@ def test_images_outside_of_the_scene_are_refused_before_they_are_opened(
     file = {"blender": "transforms_train.json", "nerfstudio": "transforms.json"}[layout]
     (folder / file).write_text(json.dumps({"camera_angle_x": 0.7, "frames": entries}))
     opened: list[str] = []
-    monkeypatch.setattr(images, "image_size", lambda path: opened.append(str(path)) or (WIDTH, HEIGHT))
-    monkeypatch.setattr("compgs.scene.frames.image_size", images.image_size)
+    monkeypatch.setattr(
+        images, "stored_size", lambda path: opened.append(str(path)) or ((WIDTH, HEIGHT), False)
+    )
+    monkeypatch.setattr("compgs.scene.frames.stored_size", images.stored_size)
     with pytest.raises(
         SceneError, match=r"scene: the image of frame 1 in .* lies outside of the scene's folder"
     ):

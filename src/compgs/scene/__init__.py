@@ -4,12 +4,12 @@ import itertools
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
 
-from compgs.errors import ConfigError, MissingSparseModel, SceneError
+from compgs.errors import ConfigError, MissingSparseModel, SceneError, UnreadableImage
 from compgs.scene.blender import TRAIN as SPLIT_FILE
 from compgs.scene.blender import read_blender
 from compgs.scene.capture import Capture, PosedImage, check_inside
@@ -25,7 +25,7 @@ from compgs.scene.images import (
     turned_as_cameras_are,
 )
 from compgs.scene.mask_files import with_masks, without_empty
-from compgs.scene.names import Names, without_suffix
+from compgs.scene.names import Names, in_other_formats
 from compgs.scene.nerfstudio import read_nerfstudio
 from compgs.scene.points import MIN_POINTS, fallback_points
 from compgs.scene.unused import unposed_photographs, unused_files
@@ -67,6 +67,8 @@ def load_scene(
     _check_views(capture, folder)
     for posed in capture.images:
         check_inside(posed.path, (folder, folder / images), f"the image of the view {posed.name!r}")
+    _check_there(capture, folder, images)
+    other_formats = in_other_formats((posed.name, posed.path) for posed in capture.images)
     capture = with_masks(_turned(capture), folder, images)
     read = [*capture.files, *(p.path for p in capture.images), *(p.mask for p in capture.images if p.mask)]
     unused = unposed_photographs(folder / images, read)
@@ -101,7 +103,7 @@ def load_scene(
         background=behind,
         extent=extent,
         source=folder,
-        notes=(*capture.notes, *of_size, *of_split, *of_masks, *of_points, *unused),
+        notes=(*capture.notes, *other_formats, *of_size, *of_split, *of_masks, *of_points, *unused),
         split=rule,
     )
 
@@ -162,9 +164,39 @@ def _read_layout(folder: Path, images: str) -> Capture:
     return replace(capture, images=tuple(sorted(capture.images, key=lambda posed: posed.name)))
 
 
+# Files of poses that are not read, as patterns of their names, and whose they are.
+POSES_OF_OTHERS = {
+    "poses_bounds.npy": "LLFF",
+    "*.nvm": "VisualSFM",
+    "bundle*.out": "Bundler",
+    "cameras.xml": "Metashape or RealityScan",
+    "*.xmp": "RealityScan",
+    "images/*.xmp": "RealityScan",
+    "*.abc": "Alembic",
+    "sfm_data.json": "OpenMVG",
+    "cameras.sfm": "Meshroom",
+    "reconstruction.json": "OpenSfM",
+}
+
+
+def _pattern(file: Path) -> str:
+    return next(pattern for pattern in POSES_OF_OTHERS if file.match(pattern))
+
+
 def _no_poses(folder: Path) -> str:
     """What to do with a folder in which no poses were found: somewhere inside it there may be some."""
     deeper = [place for pattern in ("*/", "*/*/", "*/*/*/") for place in sorted(folder.glob(pattern))]
+    if (folder / "database.db").is_file():
+        return (
+            f"{folder}: no camera poses found; database.db has COLMAP's features and matches, but no poses: run `colmap "
+            f"mapper`, which writes sparse/0, or: compgs reconstruct {shlex.quote(str(folder))} -o SCENE"
+        )
+    others = [file for pattern in POSES_OF_OTHERS for file in sorted(folder.glob(pattern))]
+    if others:
+        return (
+            f"{folder}: {others[0].relative_to(folder)} is not read: poses of {POSES_OF_OTHERS[_pattern(others[0])]}; "
+            f"export them from there for COLMAP (sparse/0) or nerfstudio (transforms.json), beside {IMAGES}/"
+        )
     inside = [p for p in deeper if find_sparse_model(p) == p or (p / "transforms.json").is_file()]
     if inside:
         way = f"; there are some in {inside[0].relative_to(folder)}/"
@@ -177,6 +209,20 @@ def _no_poses(folder: Path) -> str:
         f"points3D.bin in sparse/0), transforms_train.json (Blender) or transforms.json (nerfstudio). "
         f"For photographs alone, or a video, run: compgs reconstruct {shlex.quote(str(folder))} -o SCENE"
     )
+
+
+def _check_there(capture: Capture, folder: Path, images: str) -> None:
+    """Raises UnreadableImage where photographs are missing that lie in another folder inside the scene's."""
+    missing = [posed for posed in capture.images if not posed.path.is_file()]
+    if not missing:
+        return
+    names, wanted = Names(), PurePosixPath(missing[0].name)
+    for place in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if any(names.find(place, str(name)) for name in (wanted, wanted.name)):
+            raise UnreadableImage(
+                f"{missing[0].path}: this view's image does not exist; {place.name}/ has one of that name: name that "
+                f"folder with images=..., or rename it to {images}"
+            )
 
 
 def _check_views(capture: Capture, folder: Path) -> None:
@@ -238,7 +284,7 @@ def _prescaled(capture: Capture, folder: Path, images: str, downscale: int) -> t
         if not posed.path.is_relative_to(folder / images):
             return capture, downscale
         name = posed.path.relative_to(folder / images).as_posix()
-        path = names.find(smaller, name) or names.find(smaller, without_suffix(name))
+        path = names.find(smaller, name)
         if path is None or not _is_smaller_copy(posed, path, downscale):
             note = f"{smaller.name} is not used: {Path(name).name} is missing there or not 1/{downscale} of its size"
             return replace(capture, notes=(*capture.notes, note)), downscale

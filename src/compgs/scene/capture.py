@@ -2,7 +2,7 @@
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
@@ -54,7 +54,8 @@ def check_inside(path: Path, folders: tuple[Path, ...], what: str) -> None:
     scene's; `what` lies there.
     """
     place = Path(os.path.normpath(path.absolute()))
-    if not any(place.is_relative_to(os.path.normpath(folder.absolute())) for folder in folders):
+    of_windows = any(PureWindowsPath(path.relative_to(f)).drive for f in folders if path.is_relative_to(f))
+    if of_windows or not any(place.is_relative_to(os.path.normpath(folder.absolute())) for folder in folders):
         raise SceneError(
             f"{folders[0]}: {what} lies outside of the scene's folder; move it there, and name it relative to that"
         )

@@ -14,7 +14,7 @@ import numpy as np
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
 from compgs.scene.capture import PosedImage, check_camera, check_inside
-from compgs.scene.images import image_size
+from compgs.scene.images import stored_size
 from compgs.scene.lenses import COEFFICIENTS, lens_of
 from compgs.scene.names import Names
 from compgs.scene.split_names import LISTS
@@ -129,8 +129,14 @@ def _size(values: dict[str, Any], path: Path, place: str, file: str, notes: list
         notes.append(f"{file}: {given[0]} is not used: of w and h the other is missing")
     if len(given) == 2:
         return int(number(values, "w", place)), int(number(values, "h", place))
-    # A missing image is reported with all others, later.
-    return image_size(path) if path.is_file() else (1, 1)
+    if not path.is_file():
+        return 1, 1  # reported with all others, later
+    size, sideways = stored_size(path)
+    if not (sideways and "cx" in values and "cy" in values):
+        return size
+    # Of a photograph that is stored on its side the principal point tells which way the camera has it.
+    center = number(values, "cx", place), number(values, "cy", place)
+    return min((size, size[::-1]), key=lambda s: abs(center[0] / s[0] - 0.5) + abs(center[1] / s[1] - 0.5))
 
 
 def _focal_lengths(

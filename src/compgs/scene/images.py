@@ -346,6 +346,11 @@ KINDS = {
     b"PF\n": "a portable float map",
     b"Pf\n": "a portable float map",
     b"8BPS": "a Photoshop document",
+    b"\xff\x0a": "JPEG XL",
+    b"\0\0\0\x0cJXL ": "JPEG XL",
+    b"FUJIFILM": "a raw photograph",
+    b"<svg": "a drawing (SVG)",
+    b"%PDF": "a PDF",
 }
 
 

@@ -1,8 +1,9 @@
 """Names of photographs, as files of poses have them, and the files on disk that they mean: one way for all layouts.
 
 A name is relative to a folder. Programs write it with "/" or, on Windows, with "\\"; with a leading "./"; without the
-suffix of the file; with accents composed or decomposed (macOS stores "é" as two characters); in other letter case, as
-file systems of Windows and macOS allow. The file that is spelled exactly so goes before all others.
+suffix of the file, or with another one, where photographs were converted since; with accents composed or decomposed
+(macOS stores "é" as two characters); in other letter case, as file systems of Windows and macOS allow. The file that is
+spelled exactly so goes before all others.
 """
 
 import unicodedata
@@ -45,7 +46,10 @@ class Names:
             if found is None:
                 return None
             place = found
-        for spelled in (last, *(last + suffix for suffix in suffixes)):
+        stem = without_suffix(last)
+        # Photographs that were saved again as another format, last.
+        converted = [stem + suffix for suffix in suffixes] if stem != last else []
+        for spelled in (last, *(last + suffix for suffix in suffixes), *converted):
             found = self._entry(place, spelled)
             if found is not None and found.is_file():
                 return found
@@ -93,3 +97,20 @@ def without_suffix(name: str) -> str:
     """The name without the suffix of an image, if it has one: `frame.0001` has none."""
     stem, dot, suffix = name.rpartition(".")
     return stem if dot and f".{suffix.lower()}" in IMAGE_SUFFIXES else name
+
+
+def in_other_formats(named: Iterable[tuple[str, Path]]) -> tuple[str, ...]:
+    """A sentence if some of the files (by the name that means them) are of other formats than their names say."""
+    other = [
+        (name, path)
+        for name, path in named
+        if path.is_file()
+        and without_suffix(name) != name
+        and PurePosixPath(name).suffix.lower() != path.suffix.lower()
+    ]
+    if not other:
+        return ()
+    name, path = other[0]
+    return (
+        f"{len(other)} photographs have another suffix than in the poses, such as {path.name} for {name}",
+    )
