@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from compgs.numerics.ssim import l1_and_ssim
+from compgs.tensors import where
 from compgs.tensors.ssim import ssim
 
 COMMON_EXTENT = 5.0  # world units
@@ -77,11 +78,7 @@ def photometric_loss(
     target = target if isinstance(target, Target) else Target(target)
     y, counted, image = target.image, target.counted, exposed(image, target.exposure)
     assert image.shape == y.shape, f"image {tuple(image.shape)}, target {tuple(y.shape)}"
-    if (
-        image.device.type == "cpu"
-        and image.dtype == torch.float32
-        and y.dtype in (torch.uint8, torch.float32)
-    ):
+    if where.in_kernels(image) and y.dtype in (torch.uint8, torch.float32):
         return _FusedPhotometric.apply(image, y, counted, ssim_weight)
     if y.dtype == torch.uint8:
         y = y.to(image.dtype) / 255.0

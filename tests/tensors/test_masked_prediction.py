@@ -9,7 +9,7 @@ from compgs.losses import scale_regularizer
 from compgs.model import HeadDimensions, HybridModel
 from compgs.model.constants import OPACITY_CUTOFF
 from compgs.render import rasterize as rasterize_arrays
-from compgs.tensors import scenes
+from compgs.tensors import where
 from compgs.tensors.heads import PredictionHeads, make_heads
 from compgs.tensors.prediction import predict
 from compgs.tensors.primitives import Primitives, every_slot
@@ -59,7 +59,7 @@ def test_a_decoded_scene_looks_the_same_where_nothing_is_left_out(monkeypatch, l
     heads, p = make(layout, torch.float32)
     model = HybridModel(p.arrays(), heads.weights(), 4.0, (0.0, 0.0, 0.0))
     chosen = model.gaussians(CAMERA)
-    monkeypatch.setattr(scenes, "choosing_pays", lambda device: False)
+    monkeypatch.setattr(where, "choosing_pays", lambda device: False)
     everything = HybridOnDevice.of(model, torch.device("cpu")).gaussians(CAMERA)
     assert len(everything) == N * K > len(chosen)
     a, b = rasterize_arrays(chosen, CAMERA).image, rasterize_arrays(everything, CAMERA).image

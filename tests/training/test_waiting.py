@@ -12,6 +12,7 @@ import torch
 from compgs.config import Config
 from compgs.entropy.neighbourhood import neighbourhood
 from compgs.render import RasterResult
+from compgs.tensors import where
 from compgs.tensors.visibility import visible_mask
 from compgs.training import loop as loop_module
 from compgs.training import trainer as trainer_module
@@ -52,7 +53,7 @@ def test_a_step_needs_no_value_but_which_anchors_are_in_view(
 ):
     config = replace(tiny_config, model=replace(tiny_config.model, heads=layout))
     trainer = valueless_trainer(blob_scene, config, monkeypatch)
-    monkeypatch.setattr(trainer_module, "choosing_pays", lambda device: False)
+    monkeypatch.setattr(where, "choosing_pays", lambda device: False)
     trainer.step = int(progress * config.training.steps)
     assert trainer.train_step().loss.shape == ()
 
@@ -76,7 +77,7 @@ def test_leaving_nothing_out_trains_the_same_model(blob_scene, tiny_config, monk
     config = replace(tiny_config, training=replace(tiny_config.training, sampled_gradients=0.0))
     losses = []
     for pays in (True, False):
-        monkeypatch.setattr(trainer_module, "choosing_pays", lambda device, pays=pays: pays)
+        monkeypatch.setattr(where, "choosing_pays", lambda device, pays=pays: pays)
         trainer = Trainer(blob_scene, config, torch.device("cpu"))
         losses.append([float(trainer.train_step().loss) for _ in range(6)])
     assert losses[0] == pytest.approx(losses[1], rel=1e-4)

@@ -17,6 +17,7 @@ from compgs.entropy.gaussian import BLOCK, FASTMATH, SCALE_LEVELS, element_bits,
 from compgs.entropy.network import FRACTION_BITS, EntropyNetwork, round_fixed
 from compgs.entropy.quantization import quantize, round_straight_through
 from compgs.numerics.compiled import njit, portion
+from compgs.tensors import where
 from compgs.tensors.linear import transposed_product
 
 Noise = Callable[[Tensor], Tensor]
@@ -39,7 +40,7 @@ def code_latents(
     """
     inputs, weight, bias = network.inputs_of_last(context, network_bits)
     fixed = network_bits is not None
-    if y.device.type == "cpu" and y.dtype == inputs.dtype == torch.float32:
+    if where.in_kernels(y, inputs):
         uniform = noise(y) if rate and noise is not None else None
         y_hat, bits = _Coded.apply(y, inputs, weight, bias, uniform, rate, fixed, mask)
         return y_hat, bits

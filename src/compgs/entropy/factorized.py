@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from compgs.numerics.compiled import njit, portion
+from compgs.tensors import where
 
 REACH = 24  # symbols -24 to 24 have a bin of their own
 # No bin falls below this, as no symbol of an integer table has frequency 0.
@@ -49,7 +50,7 @@ class FactorizedDensity(nn.Module):
     ) -> Tensor:  # [N] bits of each row
         """-log2 of the mass of the unit interval around z, summed over channels."""
         p = self.probabilities()
-        if z.device.type == "cpu" and z.dtype == p.dtype == torch.float32:
+        if where.in_kernels(z, p):
             return _FusedBits.apply(z, p)
         return _torch_bits(z, p, self.reach).sum(1)
 

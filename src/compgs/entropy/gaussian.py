@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from compgs.numerics.compiled import njit, portion
+from compgs.tensors import where
 
 SCALE_LEVELS = 128  # tables of the codec
 SCALES_PER_OCTAVE = 12
@@ -50,7 +51,7 @@ def gaussian_bits(
     scale_index: Tensor,  # [N, C], clamped to the tables; outside, only a gradient that leads back passes
 ) -> Tensor:  # [N] bits of each row
     """-log2 of the Gaussian's mass on the unit interval around x, summed over channels."""
-    if x.device.type == "cpu" and x.dtype == scale_index.dtype == torch.float32:
+    if where.in_kernels(x, scale_index):
         return _FusedBits.apply(x, scale_index)
     return _torch_bits(x, _InwardClamp.apply(scale_index)).sum(1)
 

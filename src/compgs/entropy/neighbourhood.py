@@ -14,6 +14,7 @@ from compgs.numerics.compiled import njit, portion
 from compgs.ordering.neighbours import BESIDES, find_neighbours
 from compgs.ordering.order import canonical_order, level_counts, octree_depth, octree_origin
 from compgs.ordering.ranges import chosen_levels
+from compgs.tensors import where
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Neighbourhood:
         from the `centre` [C] on average over the channels, and by how much in each. latents: [N, C] of all anchors.
         """
         rows = torch.arange(len(latents), device=latents.device) if rows is None else rows
-        if latents.device.type == "cpu" and latents.dtype == torch.float32:
+        if where.in_kernels(latents):
             out = torch.zeros(len(rows), BESIDES + latents.shape[1])
             _say(
                 rows.numpy(),

@@ -188,8 +188,8 @@ def _no_poses(folder: Path) -> str:
     deeper = [place for pattern in ("*/", "*/*/", "*/*/*/") for place in sorted(folder.glob(pattern))]
     if (folder / "database.db").is_file():
         return (
-            f"{folder}: no camera poses found; database.db has COLMAP's features and matches, but no poses: run `colmap "
-            f"mapper`, which writes sparse/0, or: compgs reconstruct {shlex.quote(str(folder))} -o SCENE"
+            f"{folder}: no camera poses found; database.db has COLMAP's features and matches, but no poses: run "
+            f"`colmap mapper`, which writes sparse/0, or: compgs reconstruct {shlex.quote(str(folder))} -o SCENE"
         )
     others = [file for pattern in POSES_OF_OTHERS for file in sorted(folder.glob(pattern))]
     if others:

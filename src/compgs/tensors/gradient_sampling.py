@@ -16,7 +16,7 @@ from torch import Tensor
 
 from compgs.gaussians import Gaussians
 from compgs.numerics.compiled import njit
-from compgs.tensors.prediction import runs_in_kernels
+from compgs.tensors import where
 
 
 @dataclass
@@ -40,7 +40,7 @@ def with_sampled_gradients(
     gradients will be, if they are sampled.
     """
     g = gaussians
-    if share <= 0.0 or not runs_in_kernels(g.means.device, g.means.dtype):
+    if share <= 0.0 or not where.runs_in_kernels(g.means.device, g.means.dtype):
         return gaussians
     start = float(noise(g.means.new_empty(1))) + 0.5
     return Gaussians(

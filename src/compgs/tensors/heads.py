@@ -17,9 +17,10 @@ from torch import Tensor, nn
 
 from compgs.gaussians import Gaussians
 from compgs.model.head_weights import NETWORKS, HeadDimensions, HeadWeights, Layout
+from compgs.tensors import where
 from compgs.tensors.autograd import PairedPrediction
 from compgs.tensors.linear import Reader
-from compgs.tensors.prediction import Prediction, predict_by_torch, runs_in_kernels
+from compgs.tensors.prediction import Prediction, predict_by_torch
 from compgs.tensors.primitives import Primitives
 from compgs.tensors.residual_mlp import ResidualMLP
 
@@ -119,7 +120,7 @@ class PairedHeads(PredictionHeads):
         self, primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype = torch.float32
     ) -> Prediction:
         """On the CPU in float32 one pass of kernels; with it the networks and all around them."""
-        if not runs_in_kernels(seen.device, seen.dtype, appearance_dtype):
+        if not where.runs_in_kernels(seen.device, seen.dtype, appearance_dtype):
             return super().predict_drawn(primitives, seen, appearance_dtype)
         p = primitives
         appearance, appearance_weights = self.appearance.begin(seen)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from compgs.numerics.compiled import njit, portion
 from compgs.numerics.products import add_product
+from compgs.tensors import where
 
 PARTS = 16
 
@@ -34,8 +35,7 @@ def linear(
     weight: Tensor,  # [inputs, outputs]
     bias: Tensor,  # [outputs]
 ) -> Tensor:  # [N, outputs]
-    plain = x.device.type == "cpu" and x.dtype == weight.dtype == torch.float32
-    if plain and not torch.is_autocast_enabled("cpu"):
+    if where.in_kernels(x, weight) and not torch.is_autocast_enabled("cpu"):
         return _Linear.apply(x, weight, bias)
     return torch.addmm(bias, x, weight)
 

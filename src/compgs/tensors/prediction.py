@@ -276,16 +276,6 @@ def geometry_of_all(heads: "PredictionHeads", primitives: Primitives) -> Geometr
 # where it runs ---------------------------------------------------------------------------------
 
 
-def choosing_pays(device: torch.device) -> bool:
-    """Whether to leave out primitives that are not drawn: not where their number must first come from a GPU."""
-    return device.type != "cuda"
-
-
-def runs_in_kernels(device: torch.device, *dtypes: torch.dtype) -> bool:
-    """Whether the kernels compute it: on the CPU, in float32."""
-    return device.type == "cpu" and all(dtype == torch.float32 for dtype in dtypes)
-
-
 def appearance_precision(
     device: torch.device, dtype: torch.dtype
 ) -> contextlib.AbstractContextManager[object]:

@@ -1,12 +1,12 @@
 """One function from tensors to pixels; the device decides who draws."""
 
-import torch
 from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.render.result import RasterResult
 from compgs.render.settings import DEFAULT_SETTINGS, RasterSettings
+from compgs.tensors import where
 from compgs.tensors.reference import rasterize_reference
 
 
@@ -21,11 +21,11 @@ def rasterize(
     """
     means = gaussians.means
     # Imported here: a renderer on the CPU needs no gsplat, one on CUDA no compiled CPU kernels.
-    if means.is_cuda:
+    if where.on_gpu(means):
         from compgs.tensors.gsplat_backend import rasterize_gsplat
 
         return rasterize_gsplat(gaussians, camera, settings)
-    if means.device.type == "cpu" and means.dtype == torch.float32:
+    if where.in_kernels(means):
         from compgs.tensors.numba_backend import rasterize_numba, wants_gradients
 
         if not (settings.antialiased and wants_gradients(gaussians)):

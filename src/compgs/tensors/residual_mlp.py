@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from compgs.model.constants import NEGATIVE_SLOPE
+from compgs.tensors import where
 from compgs.tensors.autograd import KernelMLP
 from compgs.tensors.linear import linear
 
@@ -64,7 +65,7 @@ class ResidualMLP(nn.Module):
     ) -> Tensor:  # [M, outputs]
         shared, weights = self.begin(anchor_features)
         entry = weights[0]
-        if shared.device.type == "cpu" and shared.dtype == residuals.dtype == torch.float32:
+        if where.in_kernels(shared, residuals):
             return KernelMLP.apply(shared, residuals, anchor_index, *weights)
         first = torch.addmm(shared.index_select(0, anchor_index), residuals, entry)  # float16 under autocast
         x = nn.functional.leaky_relu(first[:, : self.width], NEGATIVE_SLOPE)

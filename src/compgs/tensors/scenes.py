@@ -19,10 +19,10 @@ from compgs.model.hybrid_model import BLOCK, HybridModel
 from compgs.model.splats import SplatModel
 from compgs.render.result import RasterResult
 from compgs.render.settings import RasterSettings
+from compgs.tensors import where
 from compgs.tensors.heads import PredictionHeads, heads_of
 from compgs.tensors.prediction import (
     camera_center,
-    choosing_pays,
     predict_appearance,
     predict_geometry,
     see,
@@ -183,7 +183,7 @@ class HybridOnDevice(HybridModel):
             residuals,
             rows,
             dtype=self.appearance_dtype,
-            compact=choosing_pays(rows.device),
+            compact=where.choosing_pays(rows.device),
         )
         index = coupled if found.index is None else coupled.index_select(0, found.index)
         return index, found.opacities, found.colors

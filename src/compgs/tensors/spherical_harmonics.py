@@ -11,6 +11,7 @@ from torch import Tensor
 from compgs.model import spherical_harmonics_kernels as kernels
 from compgs.model.degrees import MAX_DEGREE, coefficients
 from compgs.model.spherical_harmonics import COLOR_OFFSET, Y0, harmonics
+from compgs.tensors import where
 
 
 def dc_from_color(colors: Tensor) -> Tensor:
@@ -34,7 +35,7 @@ def view_colors(
 ) -> Tensor:  # [M, 3] display RGB, not below 0
     """What a camera sees of each splat; gradients go to means and coefficients."""
     assert 0 <= degree <= MAX_DEGREE and rest.shape[1] >= coefficients(degree) - 1, (degree, rest.shape)
-    if means.device.type == "cpu" and means.dtype == torch.float32:
+    if where.in_kernels(means):
         if visible is None:
             visible = torch.ones(len(means), dtype=torch.bool)
         colors: Tensor = _ViewColors.apply(means, dc, rest, center, degree, visible)

@@ -8,6 +8,7 @@ from torch import Tensor
 from compgs.cameras import Camera
 from compgs.render import visibility
 from compgs.render.settings import RasterSettings
+from compgs.tensors import where
 
 
 @torch.no_grad()
@@ -18,7 +19,7 @@ def visible_mask(
     settings: RasterSettings,
 ) -> Tensor:  # [N] bool
     """False only where nothing of an anchor can reach a pixel."""
-    if positions.device.type == "cpu" and positions.dtype == radii.dtype == torch.float32:
+    if where.in_kernels(positions, radii):
         arrays = positions.detach().contiguous().numpy(), radii.detach().contiguous().numpy()
         return torch.from_numpy(visibility.visible_mask(*arrays, camera, settings))
     normals = frustum_on(camera, settings, positions.dtype, positions.device)

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from compgs.tensors import where
 from compgs.tensors.linear import transposed_product
 from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import replace_parameter
@@ -40,7 +41,7 @@ def principal_axes(references: Tensor) -> Tensor:
     variances are equal, as with fewer anchors than channels.
     """
     centered = references - references.mean(0)
-    if centered.device.type == "cpu" and centered.dtype == torch.float32:
+    if where.in_kernels(centered):
         scatter = transposed_product(centered, centered)
     else:
         scatter = centered.t() @ centered

@@ -30,12 +30,12 @@ from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
+from compgs.tensors import where
 from compgs.tensors.gradient_sampling import GradientSizes, with_sampled_gradients
 from compgs.tensors.prediction import (
     Geometry,
     Prediction,
     camera_center,
-    choosing_pays,
     geometry_of_all,
     predict,
     predict_geometry,
@@ -323,7 +323,7 @@ class Trainer:
             camera_center(camera, self.device),
             model.distance_unit,
             model.stored_head_weights() if stored else None,
-            compact=choosing_pays(self.device),
+            compact=where.choosing_pays(self.device),
             appearance_dtype=getattr(torch, self.config.training.appearance_dtype),
             geometry=geometry,
         )

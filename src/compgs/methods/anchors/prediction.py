@@ -11,7 +11,8 @@ from compgs.gaussians import Gaussians
 from compgs.methods.anchors.networks import applied
 from compgs.methods.anchors.scene import Frame
 from compgs.model.constants import CUTOFF_SIGMAS
-from compgs.tensors.prediction import Prediction, choosing_pays, is_drawn, see
+from compgs.tensors import where
+from compgs.tensors.prediction import Prediction, is_drawn, see
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ def predict_anchors(
     # An identity offset keeps the norm away from zero, where the direction has no gradient.
     quaternions = torch.cat([shapes[..., 3:4] + 1.0, shapes[..., 4:]], 2).view(-1, 4)
     means = anchors.means(frame.voxel_size).view(-1, 3)
-    if not choosing_pays(seen.device):
+    if not where.choosing_pays(seen.device):
         opacities = torch.where(drawn, all_opacities, torch.zeros_like(all_opacities))
         every = torch.arange(v * k, device=seen.device)
         return Prediction(

@@ -7,12 +7,13 @@ from torch import Tensor
 
 from compgs.methods.compact_3dgs.color_network import DIRECTION_DEGREE
 from compgs.methods.compact_3dgs.hash_grid import PRIMES, GridLayout, grid_features, grid_gradient
+from compgs.tensors import where
 from compgs.tensors.spherical_harmonics import harmonic_basis
 
 
 def features(places: Tensor, grid: Tensor, layout: GridLayout) -> Tensor:
     """[V, levels x F] of places [V, 3]; gradients go to the grid. On the CPU in float32 by kernels."""
-    if places.device.type == "cpu" and grid.dtype == torch.float32:
+    if where.in_kernels(grid):
         found: Tensor = _Features.apply(places, grid, layout)
         return found
     return features_reference(places, grid, layout)
