@@ -125,8 +125,8 @@ def trained(run: Run) -> Any:
         return load_run(run.folder)
     from compgs.model.splats import SplatModel
     from compgs.tensors.splats import Splats
-    from compgs.training.checkpoint import read_checkpoint_file, tensors_by_kind
-    from compgs.training.splat_trainer import METHOD
+    from compgs.training.run.checkpoint import read_checkpoint_file, tensors_by_kind
+    from compgs.training.splats.trainer import METHOD
 
     tensors, _ = read_checkpoint_file(run.folder / CHECKPOINT_NAME, METHOD)
     return SplatModel(Splats(**tensors_by_kind(tensors)["model"]).arrays(), BLACK)
@@ -141,7 +141,7 @@ def decode(run: Run) -> dict[str, Any]:
 def opened(run: Run) -> Any:
     """A .ply does not know its background, which costs the same in every color."""
     from compgs.formats import open_scene
-    from compgs.training.loop import chosen_device
+    from compgs.training.run.loop import chosen_device
 
     return open_scene(run.file, chosen_device(run.device), BLACK)
 

@@ -106,7 +106,7 @@ def make(options: argparse.Namespace) -> dict[str, Any]:
     from made_scene import made_scene
 
     from compgs.codec.encoder import encode
-    from compgs.training.initial import initial_model
+    from compgs.training.start import initial_model
 
     model = initial_model(*made_scene(options.anchors, options.width, options.height))
     noise = torch.Generator().manual_seed(0)

@@ -70,8 +70,8 @@ def breakdown(options: argparse.Namespace) -> dict[str, Any]:
     """Milliseconds by part on a real scene."""
     from compgs.config import Config
     from compgs.scene import load_scene
-    from compgs.training.checkpoint import CHECKPOINT_NAME, load_checkpoint
-    from compgs.training.profile import WARM_UP, StepProfile
+    from compgs.training.run.checkpoint import CHECKPOINT_NAME, load_checkpoint
+    from compgs.training.run.profile import WARM_UP, StepProfile
     from compgs.training.trainer import PARTS, stations
 
     scene = load_scene(options.scene[0], downscale=options.downscale[0])
@@ -249,7 +249,7 @@ def main() -> None:
     parser.add_argument("--made", type=int, nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.job:
-        from compgs.training.allocation import freed_memory_kept
+        from compgs.training.run.allocation import freed_memory_kept
 
         with freed_memory_kept():  # as in a run
             print(json.dumps({"breakdown": breakdown, "growth": growth}[options.job](options)))

@@ -91,7 +91,7 @@ def write(request: pytest.FixtureRequest) -> Callable[[Path], None]:
     """Both ways of writing a file."""
     if request.param == "bytes":
         return lambda path: write_bytes(path, b"new")
-    from compgs.training.checkpoint import write_checkpoint_file
+    from compgs.training.run.checkpoint import write_checkpoint_file
 
     return lambda path: write_checkpoint_file(path, "compgs", {"a": torch.zeros(3)}, {})
 

@@ -8,8 +8,8 @@ import torch
 from compgs.config import Config, load_config
 from compgs.entropy.models import OwnResidualsEntropyModel
 from compgs.trained_model import TrainedModel
-from compgs.training.control import GROWTH_LEVELS, make_schedule
 from compgs.training.optimizers import make_optimizer
+from compgs.training.structure.control import GROWTH_LEVELS, make_schedule
 
 # As published; a comment where docs/paper_map.md gives a reason for another number here.
 PUBLISHED = {

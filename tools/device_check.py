@@ -189,7 +189,7 @@ def large(given: Given) -> dict[str, Any]:
 
     import compgs
     from compgs.config import load_config
-    from compgs.training.profile import StepProfile
+    from compgs.training.run.profile import StepProfile
 
     if given.scene is None:
         return {"skipped": "no --scene"}

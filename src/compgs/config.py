@@ -120,7 +120,7 @@ class EntropyConfig:
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """Adaptive control of the anchors: growth and pruning (Ref.); schedule and short runs: `training/control.py`."""
+    """Adaptive control of the anchors: growth and pruning (Ref.). `training/structure/control.py` has its schedule."""
 
     # of the steps: first control
     start: Share = 0.15
@@ -160,7 +160,7 @@ class ControlConfig:
     # of the steps: the anchors that are not worth their bits are removed
     prune_at: Shares = (0.3, 0.5, 0.6, 0.7)
     # what a mean squared change of the training views costs, in units of the loss, as pruning reckons
-    # (`training/pruning.py`)
+    # (`training/structure/pruning.py`)
     prune_worth: Annotated[float, Range(0, 1e9, above=True, below=True)] = 40.0
     # by which a bit is cheaper to it where training views are few: what adds little may be all that one view has
     prune_less: Share = 0.5
@@ -192,7 +192,7 @@ class TrainingConfig:
     # one to the next, and a step without it takes a sixth less time (not in the paper)
     rate_every: Annotated[int, Range(1, 1000)] = 4
     # of the steps until which photographs of 160 000 pixels and more are halved, larger ones more than once; 0: never
-    # (not in the paper; `training/coarse.py`)
+    # (not in the paper; `training/shortcuts/coarse.py`)
     coarse_until: Share = 0.7
     # (1 - w) L1 + w (1 - SSIM) (3DGS)
     ssim_weight: Share = 0.2
@@ -201,7 +201,7 @@ class TrainingConfig:
     # `tensors/gradient_sampling.py`)
     sampled_gradients: Annotated[float, Range(0, 100)] = 0.1
     # of the mean gradient: anchors of a view whose primitives have less, as they stand behind others, are passed over
-    # until a step with the rate looks at them again; 0: none are (not in the paper; `training/hidden.py`)
+    # until a step with the rate looks at them again; 0: none are (not in the paper; `training/shortcuts/hidden.py`)
     passed_over: Share = 0.03
     # mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
     scale_weight: Annotated[float, Range(0, 1e6, below=True)] = 0.01
@@ -231,7 +231,7 @@ class TrainingConfig:
     # of the steps, the last ones: the file holds the mean of them; 0: where the last one went (not in the paper)
     averaged: Share = 0.1
     # an affine change of color for each training view, for photographs of differing exposure or white balance: learned
-    # beside the scene, and kept out of the file (`training/exposures.py`)
+    # beside the scene, and kept out of the file (`training/step/exposures.py`)
     exposure: bool = False
     # of the primitives, that a step does without, where training views are few
     left_out: Annotated[float, Range(0, 0.5)] = 0.2
@@ -246,7 +246,7 @@ class TrainingConfig:
 class SplatConfig:
     """Plain 3D Gaussian Splatting (`--method 3dgs`; Kerbl et al. 2023), as published.
 
-    Schedules are fractions of its 30 000 steps, with floors for short runs (`training/densification.py`).
+    Schedules are fractions of its 30 000 steps, with floors for short runs (`training/splats/densification.py`).
     """
 
     # degree of the spherical harmonics at the end

@@ -22,7 +22,7 @@ from compgs.evaluation.camera_path import orbit
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.stored_weights import SHARED_RESIDUAL_BITS
 from compgs.trained_model import TrainedModel
-from compgs.training.decorrelation import keep_channels
+from compgs.training.structure.decorrelation import keep_channels
 
 OWN_RESIDUALS = Config(model=ModelConfig(residuals=True, reference_context="hyperprior"))
 

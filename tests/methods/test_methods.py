@@ -22,7 +22,7 @@ from compgs.model.splats import SplatModel
 from compgs.render import render
 from compgs.scene.generated import generate_scene
 from compgs.scene.views import Points, Scene
-from compgs.training.checkpoint import read_checkpoint_file
+from compgs.training.run.checkpoint import read_checkpoint_file
 
 STEPS = 40
 OF_SPLATS = ("3dgs", "spz", "sog", "toy")

@@ -35,7 +35,7 @@ from compgs.render import RasterSettings
 from compgs.scene.views import Scene
 from compgs.tensors.rasterize import rasterize
 from compgs.tensors.splats import splat_gaussians
-from compgs.training.splat_parameters import initial_splats
+from compgs.training.splats.parameters import initial_splats
 
 
 def chance(seed: int = 0) -> torch.Generator:

@@ -22,8 +22,8 @@ from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig
 from compgs.errors import CompGSError
 from compgs.scene.generated import generate_scene
 from compgs.scene.views import Scene, View
-from compgs.training import distributed
-from compgs.training.splat_trainer import SplatTrainer
+from compgs.training.run import distributed
+from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

@@ -36,7 +36,7 @@ def in_a_fresh_process(program: str) -> list[int]:
 import sys
 sys.path.insert(0, {folder!r})
 from test_allocation import faults_of_an_array
-from compgs.training.allocation import freed_memory_kept
+from compgs.training.run.allocation import freed_memory_kept
 """
     done = subprocess.run([sys.executable, "-c", start + program], capture_output=True, text=True, check=True)
     return [int(number) for number in done.stdout.split()]

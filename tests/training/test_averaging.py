@@ -8,7 +8,7 @@ import torch
 
 from compgs.config import Config
 from compgs.scene.views import Scene
-from compgs.training.averaging import Averaging
+from compgs.training.structure.averaging import Averaging
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

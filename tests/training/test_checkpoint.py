@@ -8,9 +8,14 @@ import torch
 
 from compgs.errors import CheckpointError, OutputError
 from compgs.interrupt import Terminated, ended_on_request, held_back
-from compgs.training import checkpoint as checkpoint_module
-from compgs.training.checkpoint import Writer, load_checkpoint, read_checkpoint_file, write_checkpoint_file
-from compgs.training.loop import Pace
+from compgs.training.run import checkpoint as checkpoint_module
+from compgs.training.run.checkpoint import (
+    Writer,
+    load_checkpoint,
+    read_checkpoint_file,
+    write_checkpoint_file,
+)
+from compgs.training.run.loop import Pace
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -84,7 +89,7 @@ def test_missing_and_damaged_checkpoints_are_named(tmp_path):
 
 
 def test_a_failed_write_keeps_the_previous_checkpoint(blob_scene, tiny_config, tmp_path, monkeypatch):
-    import compgs.training.checkpoint as module
+    import compgs.training.run.checkpoint as module
     from compgs.errors import OutputError
 
     path = tmp_path / "checkpoint.safetensors"

@@ -9,8 +9,8 @@ import torch
 from compgs.config import Config
 from compgs.losses import Target, photometric_loss
 from compgs.scene.views import Scene
-from compgs.training import coarse
-from compgs.training.coarse import CoarseViews, halvings, smaller
+from compgs.training.shortcuts import coarse
+from compgs.training.shortcuts.coarse import CoarseViews, halvings, smaller
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

@@ -10,12 +10,12 @@ from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig, lo
 from compgs.gaussians import Gaussians
 from compgs.tensors.prediction import Prediction
 from compgs.trained_model import TrainedModel
-from compgs.training import target_size
-from compgs.training.control import AdaptiveControl, ControlSchedule, make_schedule, new_cells
-from compgs.training.initial import initial_model
 from compgs.training.optimizers import make_optimizer
 from compgs.training.plan import growth_factor
-from compgs.training.rate_control import RateState
+from compgs.training.rate import target_size
+from compgs.training.rate.rate_control import RateState
+from compgs.training.start import initial_model
+from compgs.training.structure.control import AdaptiveControl, ControlSchedule, make_schedule, new_cells
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

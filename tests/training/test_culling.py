@@ -9,7 +9,7 @@ from compgs.model.constants import CUTOFF_SIGMAS
 from compgs.tensors.prediction import camera_center, predict
 from compgs.tensors.rasterize import rasterize
 from compgs.tensors.visibility import visible_mask
-from compgs.training.culling import EVERY, MARGIN, AnchorBounds
+from compgs.training.survey import EVERY, MARGIN, AnchorBounds
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

@@ -13,8 +13,8 @@ import safetensors.torch
 import torch
 
 from compgs.errors import CheckpointError
-from compgs.training.checkpoint import load_checkpoint
-from compgs.training.splat_trainer import SplatTrainer
+from compgs.training.run.checkpoint import load_checkpoint
+from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

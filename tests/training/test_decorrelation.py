@@ -11,7 +11,7 @@ from compgs.codec import decode, encode
 from compgs.config import Config, load_config
 from compgs.scene.views import Scene
 from compgs.training import trainer as trainer_module
-from compgs.training.decorrelation import (
+from compgs.training.structure.decorrelation import (
     channel_rates,
     decorrelate,
     drop_silent_channels,

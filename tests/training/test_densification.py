@@ -9,14 +9,14 @@ from compgs.cameras import Camera
 from compgs.config import SplatConfig
 from compgs.tensors.reference import rotation_matrices
 from compgs.tensors.splats import Splats
-from compgs.training.densification import (
+from compgs.training.splats.densification import (
     SPLIT_SHRINK,
     DensityControl,
     densify_schedule,
     rotate,
     split,
 )
-from compgs.training.splat_parameters import (
+from compgs.training.splats.parameters import (
     SplatParameters,
     make_splat_optimizer,
     replace_splats,

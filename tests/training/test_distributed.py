@@ -16,7 +16,7 @@ from compgs.cli.ranks import among_ranks
 from compgs.config import Config
 from compgs.errors import ConfigError, TrainingError
 from compgs.scene.views import Scene
-from compgs.training import distributed
+from compgs.training.run import distributed
 from compgs.training.trainer import Trainer
 
 SCRIPT = Path(__file__).with_name("ranks.py")

@@ -7,7 +7,7 @@ import torch
 from compgs.entropy.quantization import UniformNoise
 from compgs.gaussians import Gaussians
 from compgs.tensors.prediction import Prediction
-from compgs.training.dropout import HIGHEST_OPACITY, thinned
+from compgs.training.step.dropout import HIGHEST_OPACITY, thinned
 
 
 def every_other(count: int, opacity: float) -> Prediction:

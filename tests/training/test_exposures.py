@@ -12,8 +12,8 @@ from compgs.metrics import psnr, to_8bit
 from compgs.model.splats import SplatModel
 from compgs.render import render
 from compgs.scene.views import Scene, View
-from compgs.training.exposures import Exposures
-from compgs.training.splat_trainer import SplatTrainer
+from compgs.training.splats.trainer import SplatTrainer
+from compgs.training.step.exposures import Exposures
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

@@ -19,9 +19,9 @@ from compgs.scene.colmap import read_sparse_model
 from compgs.scene.colmap_writer import write_sparse_model
 from compgs.scene.generated import generate_scene
 from compgs.training import train, train_splats
-from compgs.training.checkpoint import load_checkpoint
-from compgs.training.loop import CHECKPOINT_NAME
-from compgs.training.splat_trainer import SplatTrainer
+from compgs.training.run.checkpoint import load_checkpoint
+from compgs.training.run.loop import CHECKPOINT_NAME
+from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

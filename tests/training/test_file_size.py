@@ -11,8 +11,8 @@ from compgs.codec.writer import write_content
 from compgs.config import Config
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
-from compgs.training.file_size import FileSize, fixed_bytes
-from compgs.training.initial import initial_model
+from compgs.training.rate.file_size import FileSize, fixed_bytes
+from compgs.training.start import initial_model
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import torch
 
 from compgs.tensors.gradient_sampling import GradientSizes
 from compgs.tensors.rasterize import rasterize
-from compgs.training.hidden import HiddenAnchors
-from compgs.training.step_views import step_views
+from compgs.training.shortcuts.hidden import HiddenAnchors
+from compgs.training.step.step_views import step_views
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

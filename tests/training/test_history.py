@@ -5,7 +5,7 @@ import math
 import pytest
 
 from compgs.training import History, TrainingStatus
-from compgs.training.history import MOST_POINTS
+from compgs.training.run.history import MOST_POINTS
 
 
 def history(psnr: list[float]) -> History:

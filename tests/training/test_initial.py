@@ -14,8 +14,8 @@ from compgs.scene.points import colors_at
 from compgs.scene.views import Scene
 from compgs.tensors.heads import make_heads
 from compgs.tensors.prediction import predict
-from compgs.training.initial import initial_model
 from compgs.training.plan import grid_spacings
+from compgs.training.start import initial_model
 
 
 @pytest.mark.parametrize("layout", ["paired", "separate"])

@@ -8,8 +8,8 @@ import torch
 
 from compgs.losses import Target
 from compgs.scene.views import Scene
-from compgs.training.loop import TrainingStatus
-from compgs.training.splat_trainer import SplatTrainer
+from compgs.training.run.loop import TrainingStatus
+from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

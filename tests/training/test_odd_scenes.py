@@ -26,7 +26,7 @@ from compgs.scene.views import Points, Scene, View, scene_extent
 from compgs.tensors.rasterize import rasterize
 from compgs.trained_model import TrainedModel
 from compgs.training import TrainingStatus
-from compgs.training.initial import initial_model
+from compgs.training.start import initial_model
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

@@ -5,8 +5,8 @@ import itertools
 import pytest
 import torch
 
-from compgs.training.initial import initial_model
 from compgs.training.optimizers import DECAYS, make_optimizer, set_learning_rates
+from compgs.training.start import initial_model
 
 
 def test_the_first_step_is_the_learning_rate_however_small_a_gradient_is(blob_scene, tiny_config):

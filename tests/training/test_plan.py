@@ -14,7 +14,6 @@ from compgs.config import Config, load_config
 from compgs.errors import ConfigError
 from compgs.losses import rate
 from compgs.scene.views import Scene
-from compgs.training.initial import plan_for, start_of
 from compgs.training.plan import (
     RULES,
     Plan,
@@ -27,6 +26,7 @@ from compgs.training.plan import (
     lambda_for,
     plan,
 )
+from compgs.training.start import plan_for, start_of
 
 DOCS = Path(__file__).parents[2] / "docs"
 LAMBDAS = [0.0, *(10 ** (n / 8) for n in range(-64, 9))]

@@ -10,8 +10,8 @@ import torch
 import compgs
 from compgs.config import Config
 from compgs.scene.views import Scene
-from compgs.training.checkpoint import load_checkpoint
 from compgs.training.plan import head_bits
+from compgs.training.run.checkpoint import load_checkpoint
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from compgs.training.profile import StepProfile
+from compgs.training.run.profile import StepProfile
 
 
 class Steps:

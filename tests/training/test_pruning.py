@@ -14,10 +14,10 @@ from compgs.render import render
 from compgs.scene.views import Scene, View
 from compgs.tensors.contributions import contributions, signed_changes
 from compgs.tensors.rasterize import rasterize
-from compgs.training.coarse import halved
 from compgs.training.plan import pruning_views
-from compgs.training.pruning import judged, paying, random_signs, squared_changes
-from compgs.training.rate_control import RateState
+from compgs.training.rate.rate_control import RateState
+from compgs.training.shortcuts.coarse import halved
+from compgs.training.structure.pruning import judged, paying, random_signs, squared_changes
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

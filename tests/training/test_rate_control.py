@@ -8,11 +8,11 @@ import torch
 
 from compgs.codec import encode
 from compgs.errors import ConfigError
-from compgs.training.control import make_schedule
-from compgs.training.file_size import FileSize
-from compgs.training.initial import initial_model
-from compgs.training.rate_control import HIGHEST, LOWEST, RateState, due, follow
-from compgs.training.target_size import TargetSize
+from compgs.training.rate.file_size import FileSize
+from compgs.training.rate.rate_control import HIGHEST, LOWEST, RateState, due, follow
+from compgs.training.rate.target_size import TargetSize
+from compgs.training.start import initial_model
+from compgs.training.structure.control import make_schedule
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

@@ -9,8 +9,8 @@ import torch
 from compgs.errors import TrainingError
 from compgs.scene.sight import depths_in
 from compgs.scene.views import Points, Scene
-from compgs.training.seen_points import check_points_seen
-from compgs.training.splat_trainer import SplatTrainer
+from compgs.training.run.seen_points import check_points_seen
+from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 
 NEAR = 0.01

@@ -9,12 +9,12 @@ import torch
 from compgs.config import Config, ControlConfig, SplatConfig
 from compgs.errors import ConfigError
 from compgs.scene.views import Scene
-from compgs.training.control import make_schedule
-from compgs.training.densification import densify_schedule
-from compgs.training.splat_trainer import SplatTrainer
-from compgs.training.step_views import noise_of_some, seen_anchors
+from compgs.training.splats.densification import densify_schedule
+from compgs.training.splats.trainer import SplatTrainer
+from compgs.training.step.step_views import noise_of_some, seen_anchors
+from compgs.training.step.views_in_turn import ViewsInTurn
+from compgs.training.structure.control import make_schedule
 from compgs.training.trainer import Trainer
-from compgs.training.views_in_turn import ViewsInTurn
 
 CPU = torch.device("cpu")
 # Nothing is left to chance: no primitive is left out, no gradient, and the likelihood sees symbols.

@@ -16,9 +16,9 @@ from compgs.tensors.rasterize import rasterize
 from compgs.tensors.splats import Splats
 from compgs.tensors.ssim import ssim
 from compgs.training import SplatTrainer, Trainer, train_splats
-from compgs.training.checkpoint import load_checkpoint
-from compgs.training.densification import DensifySchedule
-from compgs.training.splat_parameters import initial_splats
+from compgs.training.run.checkpoint import load_checkpoint
+from compgs.training.splats.densification import DensifySchedule
+from compgs.training.splats.parameters import initial_splats
 
 CPU = torch.device("cpu")
 

@@ -11,7 +11,7 @@ from compgs.config import Config
 from compgs.render import render
 from compgs.scene.views import Scene, View
 from compgs.tensors.ssim import ssim
-from compgs.training.rate_control import RateState
+from compgs.training.rate.rate_control import RateState
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

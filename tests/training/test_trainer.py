@@ -12,7 +12,7 @@ from compgs.render import RasterSettings, render
 from compgs.scene.views import View
 from compgs.tensors.rasterize import rasterize
 from compgs.training import train
-from compgs.training.importance import worth_keeping
+from compgs.training.structure.importance import worth_keeping
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

@@ -14,8 +14,8 @@ from compgs.entropy.neighbourhood import neighbourhood
 from compgs.render import RasterResult
 from compgs.tensors import where
 from compgs.tensors.visibility import visible_mask
-from compgs.training import loop as loop_module
 from compgs.training import trainer as trainer_module
+from compgs.training.run import loop as loop_module
 from compgs.training.trainer import Trainer
 
 META = torch.device("meta")

@@ -237,7 +237,7 @@ def print_compressed(compressed: "Compressed") -> None:
 def interrupted(output: Path) -> str:
     """What to tell someone who stopped it."""
     from compgs.compressing import folder_of
-    from compgs.training.checkpoint import CHECKPOINT_NAME
+    from compgs.training.run.checkpoint import CHECKPOINT_NAME
 
     if not (folder_of(output) / CHECKPOINT_NAME).is_file():
         return "interrupted before the first checkpoint: nothing was kept"

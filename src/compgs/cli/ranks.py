@@ -14,8 +14,8 @@ def among_ranks(device: str | None) -> Iterator[bool]:
 
     The others say nothing, but what goes wrong, and on which rank.
     """
-    from compgs.training.distributed import joined, launched_rank
-    from compgs.training.loop import chosen_device
+    from compgs.training.run.distributed import joined, launched_rank
+    from compgs.training.run.loop import chosen_device
 
     rank = launched_rank()
     if rank == 0:
@@ -37,7 +37,7 @@ def among_ranks(device: str | None) -> Iterator[bool]:
 
 def several() -> bool:
     """Whether this process is one of several."""
-    from compgs.training.distributed import launched
+    from compgs.training.run.distributed import launched
 
     return launched()
 

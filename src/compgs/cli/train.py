@@ -460,7 +460,7 @@ def say_miss(folder: Path, target: int) -> None:
     say(f"asked {size(target)}, written {size(written)}: {100 * miss:+.1f} %")
     facts = add_facts(folder, {"target_bytes": target, "bytes": written, "miss": miss})
     if abs(miss) > NOTABLE_MISS:
-        from compgs.training.rate_control import HIGHEST, LOWEST
+        from compgs.training.rate.rate_control import HIGHEST, LOWEST
 
         lmbda = (
             f"lambda ended at {facts['lmbda']:.3g}, within {LOWEST:g} to {HIGHEST:g}"

@@ -11,7 +11,7 @@ from compgs.cli.usage import UsageError, check_range
 
 if TYPE_CHECKING:
     from compgs.scene import Scene
-    from compgs.training.loop import TrainingStatus, Trains
+    from compgs.training.run.loop import TrainingStatus, Trains
     from compgs.viewer.live import LiveViewer
     from compgs.viewer.shown import GrowingShown, Shown
     from compgs.viewer.stage import SpareTime, Stage

@@ -34,8 +34,8 @@ from compgs.model.splats import SplatModel
 from compgs.outputs import check_output_file, check_output_folder, write_json
 from compgs.scene.views import Scene
 from compgs.training import Plan, TrainingStatus, plan_for
-from compgs.training.checkpoint import CHECKPOINT_NAME
-from compgs.training.loop import chosen_device as training_device
+from compgs.training.run.checkpoint import CHECKPOINT_NAME
+from compgs.training.run.loop import chosen_device as training_device
 
 SPLATS_PER_ANCHOR = 4.0  # at the start; growth adds anchors, pruning removes them
 HELD_OUT_EVERY = 8  # of given cameras, by name: as scenes are split (`load_scene`)

@@ -7,7 +7,7 @@ from compgs.config import Config
 from compgs.methods import train
 from compgs.scene.views import Scene
 from compgs.training import TrainingStatus, plan_for
-from compgs.training.loop import chosen_device
+from compgs.training.run.loop import chosen_device
 
 TRIED = 40  # steps; the pace is that of the later ones
 TRIED_VIEWS = 12

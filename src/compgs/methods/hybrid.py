@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
     from compgs.trained_model import TrainedModel
-    from compgs.training.loop import Run
+    from compgs.training.run.loop import Run
 
 
 def _train(scene: "Scene", config: "Config", run: "Run", start: "SplatModel | None" = None) -> "TrainedModel":

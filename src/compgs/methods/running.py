@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from compgs.devices import Device
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.loop import TrainingStatus, Watch
     from compgs.training.plan import Plan
-    from compgs.training.profile import StepProfile
+    from compgs.training.run.loop import TrainingStatus, Watch
+    from compgs.training.run.profile import StepProfile
 
 
 def method_of(name: str) -> Method:
@@ -72,7 +72,7 @@ def train(
     """
     require("train", "training")
     from compgs.scene import as_scene
-    from compgs.training.loop import Run
+    from compgs.training.run.loop import Run
 
     known = method_of(method)
     chosen = _chosen_config(known, config, preset)

@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from compgs.config import Config
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.loop import Run
+    from compgs.training.run.loop import Run
 
 
 def train_plain(
     scene: "Scene", config: "Config", run: "Run", start: "SplatModel | None" = None
 ) -> "SplatModel":
     """Plain 3DGS; with `start`, these splats as they are. Raises as `compgs.train` does."""
-    from compgs.training.phases import Phase, train_phases
+    from compgs.training.splats.phases import Phase, train_phases
 
     return train_phases(scene, (Phase(config),), run, start).model()
 

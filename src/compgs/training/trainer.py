@@ -42,8 +42,12 @@ from compgs.tensors.prediction import (
 )
 from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
-from compgs.training.averaging import Averaging
-from compgs.training.checkpoint import (
+from compgs.training.optimizers import DECAYS, make_optimizer, parameters_of, set_learning_rates
+from compgs.training.plan import LOOKED_AT, Plan, head_bits, plan
+from compgs.training.rate.file_size import anchor_bits, fixed_bytes
+from compgs.training.rate.rate_control import RateState
+from compgs.training.rate.target_size import TargetSize
+from compgs.training.run.checkpoint import (
     Checkpoint,
     Writer,
     check_same_run,
@@ -52,11 +56,7 @@ from compgs.training.checkpoint import (
     restore_optimizer,
     save_checkpoint,
 )
-from compgs.training.coarse import CoarseViews
-from compgs.training.control import AdaptiveControl, make_schedule
-from compgs.training.culling import MEASURED_AT_ONCE, AnchorBounds
-from compgs.training.decorrelation import channel_rates, decorrelate, drop_silent_channels
-from compgs.training.distributed import (
+from compgs.training.run.distributed import (
     check_identical,
     leave_to_first,
     mine,
@@ -64,13 +64,7 @@ from compgs.training.distributed import (
     sum_over_ranks,
     whole,
 )
-from compgs.training.dropout import thinned
-from compgs.training.events import Event, at_shares
-from compgs.training.file_size import anchor_bits, fixed_bytes
-from compgs.training.hidden import HiddenAnchors
-from compgs.training.importance import missed, spread, view_contributions
-from compgs.training.initial import initial_model, start_of
-from compgs.training.loop import (
+from compgs.training.run.loop import (
     Run,
     StepResult,
     TrainingStatus,
@@ -80,16 +74,22 @@ from compgs.training.loop import (
     rasterize_step,
     run_to_end,
 )
-from compgs.training.optimizers import DECAYS, make_optimizer, parameters_of, set_learning_rates
-from compgs.training.plan import LOOKED_AT, Plan, head_bits, plan
-from compgs.training.profile import StepProfile
-from compgs.training.pruning import judged, paying, squared_changes
-from compgs.training.rate_control import RateState
-from compgs.training.restoring import check_tensor, restore_chance, restore_statistics, restoring
-from compgs.training.seen_points import check_points_seen
-from compgs.training.step_views import Noise, StepViews, step_views
-from compgs.training.target_size import TargetSize
-from compgs.training.views_in_turn import ViewsInTurn
+from compgs.training.run.profile import StepProfile
+from compgs.training.run.restoring import check_tensor, restore_chance, restore_statistics, restoring
+from compgs.training.run.seen_points import check_points_seen
+from compgs.training.shortcuts.coarse import CoarseViews
+from compgs.training.shortcuts.hidden import HiddenAnchors
+from compgs.training.start import initial_model, start_of
+from compgs.training.step.dropout import thinned
+from compgs.training.step.step_views import Noise, StepViews, step_views
+from compgs.training.step.views_in_turn import ViewsInTurn
+from compgs.training.structure.averaging import Averaging
+from compgs.training.structure.control import AdaptiveControl, make_schedule
+from compgs.training.structure.decorrelation import channel_rates, decorrelate, drop_silent_channels
+from compgs.training.structure.events import Event, at_shares
+from compgs.training.structure.importance import missed, spread, view_contributions
+from compgs.training.structure.pruning import judged, paying, squared_changes
+from compgs.training.survey import MEASURED_AT_ONCE, AnchorBounds
 
 METHOD = "compgs"
 

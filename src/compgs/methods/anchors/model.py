@@ -12,7 +12,7 @@ from compgs.methods.anchors.prediction import AnchorValues
 from compgs.methods.anchors.scene import AnchorScene, Frame
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
-from compgs.training.initial import anchor_grid, anchor_spacing
+from compgs.training.start import anchor_grid, anchor_spacing
 
 SIZES = 3  # log scales of the Gaussians; those of the positions stand before them
 

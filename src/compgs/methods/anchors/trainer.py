@@ -1,4 +1,4 @@
-"""Training of such anchors without rate; methods add theirs (`training/loop.py` has the loop)."""
+"""Training of such anchors without rate; methods add theirs (`training/run/loop.py` has the loop)."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,8 @@ from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
 from compgs.tensors.prediction import Prediction, camera_center
 from compgs.tensors.visibility import visible_mask
-from compgs.training.checkpoint import (
+from compgs.training.optimizers import ADAM_EPSILON, DECAYS, set_learning_rates
+from compgs.training.run.checkpoint import (
     Writer,
     check_same_run,
     optimizer_tensors,
@@ -30,11 +31,9 @@ from compgs.training.checkpoint import (
     tensors_by_kind,
     write_checkpoint_file,
 )
-from compgs.training.control import AdaptiveControl, make_schedule
-from compgs.training.distributed import world
-from compgs.training.loop import Run, StepResult, rasterize_step, run_to_end
-from compgs.training.optimizers import ADAM_EPSILON, DECAYS, set_learning_rates
-from compgs.training.restoring import (
+from compgs.training.run.distributed import world
+from compgs.training.run.loop import Run, StepResult, rasterize_step, run_to_end
+from compgs.training.run.restoring import (
     check_moments,
     check_step,
     check_tensor,
@@ -44,9 +43,10 @@ from compgs.training.restoring import (
     restore_statistics,
     restoring,
 )
-from compgs.training.seen_points import check_points_seen
+from compgs.training.run.seen_points import check_points_seen
+from compgs.training.step.views_in_turn import ViewsInTurn
+from compgs.training.structure.control import AdaptiveControl, make_schedule
 from compgs.training.trainer import stations, vanishing_loss
-from compgs.training.views_in_turn import ViewsInTurn
 
 
 class AnchorTrainer:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from compgs.methods.parts.content import Content
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.loop import Run
+    from compgs.training.run.loop import Run
 
 NAME = "c3dgs"
 
@@ -61,7 +61,7 @@ def train(scene: "Scene", config: C3DGSConfig, run: "Run", start: "SplatModel | 
     """The content of the file. Raises as `compgs.train` does."""
     from compgs.methods.c3dgs.hooks import SharedEntries
     from compgs.methods.parts.content import Content
-    from compgs.training.phases import Phase, fine_tuning, train_phases
+    from compgs.training.splats.phases import Phase, fine_tuning, train_phases
 
     steps = max(1, round(config.c3dgs.tuned * config.training.steps))
     tuned = Phase(fine_tuning(config, steps), lambda: SharedEntries(config))

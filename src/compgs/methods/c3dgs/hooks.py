@@ -21,12 +21,12 @@ from compgs.methods.parts.books import entries_within
 from compgs.methods.parts.fake_quantization import fake_half, fake_levels
 from compgs.methods.parts.vector_quantization import averaged_codes, first_codes, nearest_codes
 from compgs.tensors.splats import Splats
-from compgs.training.hooks import Hooks
-from compgs.training.importance import spread
 from compgs.training.plan import PRUNED_BY
+from compgs.training.splats.hooks import Hooks
+from compgs.training.structure.importance import spread
 
 if TYPE_CHECKING:
-    from compgs.training.splat_trainer import SplatTrainer
+    from compgs.training.splats.trainer import SplatTrainer
 
 SEED = 12  # of the first codes, beside the run's
 OPACITY_MARGIN = 1e-6  # as where the file is read (`compgs.formats.arrays`)

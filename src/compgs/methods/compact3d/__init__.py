@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from compgs.methods.parts.content import Content
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.loop import Run
+    from compgs.training.run.loop import Run
 
 NAME = "compact3d"
 
@@ -67,7 +67,7 @@ def train(
     """The content of the file. Raises as `compgs.train` does."""
     from compgs.methods.compact3d.hooks import LearnedCodebooks
     from compgs.methods.parts.content import Content
-    from compgs.training.phases import Phase, train_phases
+    from compgs.training.splats.phases import Phase, train_phases
 
     trainer = train_phases(
         scene, (Phase(config, lambda: LearnedCodebooks(config.compact3d, config.training)),), run

@@ -21,10 +21,10 @@ from compgs.methods.parts.fake_quantization import straight_through
 from compgs.methods.parts.vector_quantization import code_means, first_codes, k_means
 from compgs.model.degrees import degree_of
 from compgs.tensors.splats import Splats
-from compgs.training.hooks import Drawn, Hooks
+from compgs.training.splats.hooks import Drawn, Hooks
 
 if TYPE_CHECKING:
-    from compgs.training.splat_trainer import SplatTrainer
+    from compgs.training.splats.trainer import SplatTrainer
 
 CODED = (*LABELED, SORTED)
 LEAST_EVERY = 20  # steps between two assignments in short runs: in fewer, values hardly move to other codes

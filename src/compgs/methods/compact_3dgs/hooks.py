@@ -21,7 +21,7 @@ from compgs.scene.views import Scene
 from compgs.tensors.splats import Splats
 from compgs.training import Drawn, Hooks, Phase, Run, SplatTrainer, train_phases
 from compgs.training.optimizers import rates_for
-from compgs.training.splat_trainer import HOOKS
+from compgs.training.splats.trainer import HOOKS
 
 FIRST_MASK = 1.0  # logit
 HIDDEN_LOGIT = -30.0  # opacity of a splat that its mask hides: far below what is drawn

@@ -15,7 +15,7 @@ from compgs.methods.cosa.entropy import CausalChain, Chained, ContextNetwork, No
 from compgs.methods.cosa.settings import CosaConfig
 from compgs.methods.cosa.shape import ChainShape
 from compgs.ordering.order import octree_depth, octree_origin
-from compgs.training.file_size import OTHER_BYTES, gaussian_entropy
+from compgs.training.rate.file_size import OTHER_BYTES, gaussian_entropy
 
 NOT_BEGUN = -1  # depth of the cube while there is no rate
 BIAS_BITS = 14  # biases of the rendering networks are few: they keep more bits than the weights

@@ -23,11 +23,11 @@ from compgs.model.degrees import harmonics_above_dc
 from compgs.scene.views import Scene
 from compgs.tensors.splats import Splats
 from compgs.training import Hooks, Phase, Run, SplatTrainer, train_phases
-from compgs.training.coarse import smaller
-from compgs.training.importance import spread
 from compgs.training.optimizers import rates_for, replace_parameter
 from compgs.training.plan import PRUNED_BY
-from compgs.training.splat_trainer import HOOKS
+from compgs.training.shortcuts.coarse import smaller
+from compgs.training.splats.trainer import HOOKS
+from compgs.training.structure.importance import spread
 
 RAW_BYTES = 36  # of a splat: position, color, scale
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from compgs.methods.parts.content import Content
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.loop import Run
+    from compgs.training.run.loop import Run
 
 NAME = "lightgaussian"
 
@@ -74,7 +74,7 @@ def train(
     """The content of the file. Raises as `compgs.train` does."""
     from compgs.methods.lightgaussian.hooks import Distilled, Pruned, content
     from compgs.methods.parts.content import Content
-    from compgs.training.phases import Phase, fine_tuning, train_phases
+    from compgs.training.splats.phases import Phase, fine_tuning, train_phases
 
     section, steps = config.lightgaussian, config.training.steps
     settled, distilled = (

@@ -19,12 +19,12 @@ from compgs.model.degrees import degree_of, harmonics_above_dc
 from compgs.tensors.rasterize import rasterize
 from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
 from compgs.tensors.visibility import visible_mask
-from compgs.training.hooks import Hooks
-from compgs.training.importance import spread
 from compgs.training.plan import PRUNED_BY
+from compgs.training.splats.hooks import Hooks
+from compgs.training.structure.importance import spread
 
 if TYPE_CHECKING:
-    from compgs.training.splat_trainer import SplatTrainer
+    from compgs.training.splats.trainer import SplatTrainer
 
 SEED = 13  # of the first codes, beside the run's
 LARGE = 0.9  # of the splats are not smaller than the one whose volume counts as 1

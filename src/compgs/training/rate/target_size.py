@@ -9,11 +9,11 @@ from torch import Tensor
 
 from compgs.errors import ConfigError, TrainingError
 from compgs.trained_model import TrainedModel
-from compgs.training.control import ControlSchedule
-from compgs.training.file_size import FileSize, anchor_bits, fixed_bytes
-from compgs.training.importance import missed
-from compgs.training.pruning import paying
-from compgs.training.rate_control import LOOKS, RateState, due, follow
+from compgs.training.rate.file_size import FileSize, anchor_bits, fixed_bytes
+from compgs.training.rate.rate_control import LOOKS, RateState, due, follow
+from compgs.training.structure.control import ControlSchedule
+from compgs.training.structure.importance import missed
+from compgs.training.structure.pruning import paying
 
 SETTLES = (
     1.03  # as large files may be after the last pruning: they come down by that in what is left of a run

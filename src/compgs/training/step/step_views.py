@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from compgs.entropy.quantization import UniformNoise
-from compgs.training.distributed import mine
+from compgs.training.run.distributed import mine
 
 Noise = Callable[[Tensor], Tensor]  # of the shape of what it is given
 

@@ -3,7 +3,7 @@
     splats ──activate, harmonics──► Gaussians ──rasterize──► image ──(1 - w) L1 + w (1 - SSIM)──► loss
 
 Same scenes, views, rasterizer, loss and evaluation as the hybrid method's (`training/trainer.py`); no networks, no
-quantization, no rate. Methods that compress splats build on it by `training/hooks.py`.
+quantization, no rate. Methods that compress splats build on it by `training/splats/hooks.py`.
 """
 
 import json
@@ -26,7 +26,8 @@ from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
 from compgs.tensors.visibility import visible_mask
-from compgs.training.checkpoint import (
+from compgs.training.optimizers import exponential_decay, parameters_of, rates_for, set_learning_rates
+from compgs.training.run.checkpoint import (
     Writer,
     check_same_run,
     optimizer_tensors,
@@ -35,10 +36,8 @@ from compgs.training.checkpoint import (
     tensors_by_kind,
     write_checkpoint_file,
 )
-from compgs.training.densification import DensityControl, densify_schedule
-from compgs.training.distributed import check_identical, leave_to_first, mine, sum_gradients, whole
-from compgs.training.hooks import Drawn, Hooks, hook_state, parameter_groups, restore_hooks
-from compgs.training.loop import (
+from compgs.training.run.distributed import check_identical, leave_to_first, mine, sum_gradients, whole
+from compgs.training.run.loop import (
     Run,
     StepResult,
     TrainingStatus,
@@ -47,9 +46,8 @@ from compgs.training.loop import (
     rasterize_step,
     run_to_end,
 )
-from compgs.training.optimizers import exponential_decay, parameters_of, rates_for, set_learning_rates
-from compgs.training.profile import StepProfile
-from compgs.training.restoring import (
+from compgs.training.run.profile import StepProfile
+from compgs.training.run.restoring import (
     check_moments,
     check_step,
     check_tensor,
@@ -58,8 +56,10 @@ from compgs.training.restoring import (
     restore_statistics,
     restoring,
 )
-from compgs.training.seen_points import check_points_seen
-from compgs.training.splat_parameters import (
+from compgs.training.run.seen_points import check_points_seen
+from compgs.training.splats.densification import DensityControl, densify_schedule
+from compgs.training.splats.hooks import Drawn, Hooks, hook_state, parameter_groups, restore_hooks
+from compgs.training.splats.parameters import (
     SplatParameters,
     initial_splats,
     make_splat_optimizer,
@@ -68,7 +68,7 @@ from compgs.training.splat_parameters import (
     replace_splats,
     reset_opacities,
 )
-from compgs.training.views_in_turn import ViewsInTurn
+from compgs.training.step.views_in_turn import ViewsInTurn
 
 METHOD = "3dgs"
 HOOKS = "hooks/"  # before the names of the hooks' parameters, in checkpoints and in the optimizer
@@ -93,7 +93,7 @@ def train_splats(
 
     Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
     """
-    from compgs.training.phases import Phase, train_phases
+    from compgs.training.splats.phases import Phase, train_phases
 
     config = chosen_config(config, preset)
     run = Run(METHOD, output=output, resume=resume, on_progress=on_progress, device=device, profile=profile)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.losses import Target
-from compgs.training.views_in_turn import ViewsInTurn
+from compgs.training.step.views_in_turn import ViewsInTurn
 
 COARSEST_PIXELS = 40_000
 KEPT_BYTES = 1 << 29  # of coarse photographs, 3 bytes a pixel

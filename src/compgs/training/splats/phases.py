@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 from compgs.config import Config
 from compgs.model.splats import SplatModel
 from compgs.scene.views import Scene
-from compgs.training.checkpoint import read_checkpoint_file
-from compgs.training.hooks import Hooks
-from compgs.training.loop import Run, TrainingStatus
-from compgs.training.restoring import restoring
-from compgs.training.splat_trainer import PARTS, SplatTrainer, stations
+from compgs.training.run.checkpoint import read_checkpoint_file
+from compgs.training.run.loop import Run, TrainingStatus
+from compgs.training.run.restoring import restoring
+from compgs.training.splats.hooks import Hooks
+from compgs.training.splats.trainer import PARTS, SplatTrainer, stations
 
 
 @dataclass(frozen=True)

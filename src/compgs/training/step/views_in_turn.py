@@ -17,8 +17,8 @@ from torch import Tensor
 from compgs.errors import ConfigError
 from compgs.losses import Target
 from compgs.scene.views import Scene, View
-from compgs.training.distributed import world
-from compgs.training.exposures import Exposures
+from compgs.training.run.distributed import world
+from compgs.training.step.exposures import Exposures
 
 KEPT_BYTES = 8 << 30  # of photographs on a GPU, 3 bytes a pixel
 

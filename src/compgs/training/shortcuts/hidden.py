@@ -20,7 +20,7 @@ from compgs.losses import FEW_DRAWN
 from compgs.numerics.compiled import njit
 from compgs.tensors.gradient_sampling import GradientSizes
 from compgs.tensors.prediction import Prediction
-from compgs.training.restoring import check_tensor
+from compgs.training.run.restoring import check_tensor
 
 
 class HiddenAnchors:

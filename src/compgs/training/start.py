@@ -17,9 +17,9 @@ from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.trained_model import TrainedModel
-from compgs.training.distributed import world
 from compgs.training.plan import Plan, Start, grid_spacings, head_bits, lambda_for, plan
-from compgs.training.seen_points import sightings
+from compgs.training.run.distributed import world
+from compgs.training.run.seen_points import sightings
 
 CPU = torch.device("cpu")
 COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed

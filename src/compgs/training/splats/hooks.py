@@ -1,4 +1,4 @@
-"""What a method adds to plain 3DGS: the moments of a run at which it may act (`training/splat_trainer.py`).
+"""What a method adds to plain 3DGS: the moments of a run at which it may act (`training/splats/trainer.py`).
 
     parameters ──transform──► splats ──rasterize──► image ──compare, + loss──► gradients ──► step ──► after_step
                                at the steps of density control: ──► densified
@@ -20,7 +20,7 @@ from compgs.render import RasterResult
 from compgs.tensors.splats import Splats
 
 if TYPE_CHECKING:
-    from compgs.training.splat_trainer import SplatTrainer
+    from compgs.training.splats.trainer import SplatTrainer
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from compgs.scene.points import COORDINATE_BITS
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
 from compgs.training.plan import Plan
-from compgs.training.restoring import (
+from compgs.training.run.restoring import (
     check_moments,
     check_step,
     check_tensor,

@@ -23,7 +23,7 @@ from compgs.losses import RATE_PER_BIT
 from compgs.render import RasterSettings
 from compgs.tensors.contributions import signed_changes
 from compgs.tensors.prediction import Prediction
-from compgs.training.coarse import COARSEST_PIXELS, halved, times_halved
+from compgs.training.shortcuts.coarse import COARSEST_PIXELS, halved, times_halved
 
 MOST = 0.5  # of the anchors, that one pruning takes: what replaces each other must not go together
 # A further pruning takes what the first would at a higher price, about: by then the others have taken over (plush_480

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from compgs.errors import CheckpointError
 from compgs.trained_model import TrainedModel
-from compgs.training.checkpoint import CHECKPOINT_NAME, load_checkpoint
+from compgs.training.run.checkpoint import CHECKPOINT_NAME, load_checkpoint
 
 
 def load_run(folder: str | Path) -> TrainedModel:

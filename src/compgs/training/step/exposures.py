@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from compgs.training.restoring import check_tensor
+from compgs.training.run.restoring import check_tensor
 
 # Per step on a view, first and last of a run (exponential between them): it is looked at a few dozen times.
 LEARNING_RATES = (0.05, 0.001)

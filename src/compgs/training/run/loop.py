@@ -19,11 +19,11 @@ from compgs.interrupt import held_back
 from compgs.losses import Target, exposed
 from compgs.render import RasterResult, RasterSettings, Renderable
 from compgs.tensors.rasterize import rasterize
-from compgs.training.allocation import freed_memory_kept
-from compgs.training.checkpoint import CHECKPOINT_NAME, Writer
-from compgs.training.distributed import local_device, on_any_rank, rank, stopping_together
 from compgs.training.plan import Plan
-from compgs.training.profile import StepProfile
+from compgs.training.run.allocation import freed_memory_kept
+from compgs.training.run.checkpoint import CHECKPOINT_NAME, Writer
+from compgs.training.run.distributed import local_device, on_any_rank, rank, stopping_together
+from compgs.training.run.profile import StepProfile
 
 REPORT_EVERY = 10  # steps between two status reports
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it may look at every primitive

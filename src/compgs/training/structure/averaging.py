@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from compgs.training.restoring import check_tensor, whole_number
+from compgs.training.run.restoring import check_tensor, whole_number
 
 
 class Averaging:

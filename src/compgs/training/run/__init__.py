@@ -1,0 +1,12 @@
+"""How a training is carried out, whatever is trained: nothing here changes what comes out.
+
+| file | does |
+|---|---|
+| `loop` | goes through the steps, reports progress, and stops at any time |
+| `checkpoint`, `restoring` | write and read what a run needs to go on |
+| `distributed` | shares a step among the processes of a torchrun |
+| `profile`, `history` | say where the time went, and how the quality rose |
+| `allocation` | keeps memory that a step frees for the next one |
+| `seen_points` | checks that poses and points fit together |
+| `finished` | loads the model of a run that has ended |
+"""
