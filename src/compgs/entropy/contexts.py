@@ -5,7 +5,8 @@ principal axes (`training/structure/decorrelation.py`) have little left that z c
 hardly saves what it costs, and with its network and tables it costs more, by 2 % of a file of 30 kB and 5 % of one of 4
 kB. So small files have none (`NoContext`, rule `no_context`), and others have what anchors around have, which costs
 nothing and says more (`entropy/neighbourhood.py`). But training goes on to pay by a hyperprior: it says of each anchor
-by itself how far from the others it may be, where neighbours would have all of them alike."""
+by itself how far from the others it may be, where neighbours would have all of them alike.
+"""
 
 from collections.abc import Callable, Iterator
 from typing import ClassVar
