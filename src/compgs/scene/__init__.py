@@ -1,42 +1,33 @@
 """What was captured: `load_scene` finds the layout of a folder and reads views, poses and points."""
 
 import itertools
-import shlex
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from compgs.errors import ConfigError, MissingSparseModel, SceneError, UnreadableImage
+from compgs.errors import ConfigError, MissingSparseModel, SceneError
 from compgs.scene.blender import TRAIN as SPLIT_FILE
 from compgs.scene.blender import read_blender
-from compgs.scene.capture import Capture, PosedImage, check_inside
+from compgs.scene.capture import Capture, check_inside
 from compgs.scene.colmap import find_sparse_model
 from compgs.scene.colmap_capture import read_colmap
 from compgs.scene.hold_out import Split, check_split, every, sector
-from compgs.scene.images import (
-    Progress,
-    downscaled_size,
-    image_size,
-    load_views,
-    stored_size,
-    turned_as_cameras_are,
-)
+from compgs.scene.images import Progress, load_views
 from compgs.scene.mask_files import with_masks, without_empty
-from compgs.scene.names import Names, in_other_formats
+from compgs.scene.names import in_other_formats
 from compgs.scene.nerfstudio import read_nerfstudio
+from compgs.scene.no_poses import check_there, no_poses
 from compgs.scene.points import MIN_POINTS, fallback_points
+from compgs.scene.sizes import AUTO, sized, turned
 from compgs.scene.unused import unposed_photographs, unused_files
 from compgs.scene.views import Points, Scene, View, scene_extent
 
 __all__ = ["Points", "Scene", "View", "as_scene", "extent_of", "load_scene"]
 
 IMAGES = "images"
-AUTO = "auto"
-LARGE = 2_000_000  # pixels of a photograph, from which `downscale="auto"` reduces
-LONGEST_SIDE = 1_600  # pixels that it leaves of the longer side, as 3DGS does
 FALLBACK_POINTS = 20_000  # random points of a scene without sparse points
 MAX_DOWNSCALE = 32  # beyond it somebody means a width in pixels
 
@@ -67,12 +58,12 @@ def load_scene(
     _check_views(capture, folder)
     for posed in capture.images:
         check_inside(posed.path, (folder, folder / images), f"the image of the view {posed.name!r}")
-    _check_there(capture, folder, images)
+    check_there(capture, folder, images)
     other_formats = in_other_formats((posed.name, posed.path) for posed in capture.images)
-    capture = with_masks(_turned(capture), folder, images)
+    capture = with_masks(turned(capture), folder, images)
     read = [*capture.files, *(p.path for p in capture.images), *(p.mask for p in capture.images if p.mask)]
     unused = unposed_photographs(folder / images, read)
-    capture, factor, of_size = _sized(capture, folder, images, downscale)
+    capture, factor, of_size = sized(capture, folder, images, downscale)
     read += [posed.path for posed in capture.images]
     unused += unused_files(folder, read, (folder / images,))
 
@@ -93,8 +84,6 @@ def load_scene(
     views, of_masks = without_empty(found, looked_at)
     if held_out and not any(view.name in held_out for view in views):
         held_out = every([view.name for view in views], test_every)
-    if all(view.name in held_out for view in views):
-        raise SceneError(f"{folder}: all {len(views)} views are held out; name some to train on ({rule})")
     return Scene(
         name=folder.resolve().name,
         train_views=tuple(v for v in views if v.name not in held_out),
@@ -157,72 +146,11 @@ def _read_layout(folder: Path, images: str) -> Capture:
     elif (folder / "transforms.json").is_file():
         capture = read_nerfstudio(folder)
     else:
-        raise MissingSparseModel(_no_poses(folder))
+        raise MissingSparseModel(no_poses(folder))
     if sparse is None and images != IMAGES:
         note = f"images={images} is not used: {capture.files[0].name} says where the images are"
         capture = replace(capture, notes=(*capture.notes, note))
     return replace(capture, images=tuple(sorted(capture.images, key=lambda posed: posed.name)))
-
-
-# Files of poses that are not read, as patterns of their names, and whose they are.
-POSES_OF_OTHERS = {
-    "poses_bounds.npy": "LLFF",
-    "*.nvm": "VisualSFM",
-    "bundle*.out": "Bundler",
-    "cameras.xml": "Metashape or RealityScan",
-    "*.xmp": "RealityScan",
-    "images/*.xmp": "RealityScan",
-    "*.abc": "Alembic",
-    "sfm_data.json": "OpenMVG",
-    "cameras.sfm": "Meshroom",
-    "reconstruction.json": "OpenSfM",
-}
-
-
-def _pattern(file: Path) -> str:
-    return next(pattern for pattern in POSES_OF_OTHERS if file.match(pattern))
-
-
-def _no_poses(folder: Path) -> str:
-    """What to do with a folder in which no poses were found: somewhere inside it there may be some."""
-    deeper = [place for pattern in ("*/", "*/*/", "*/*/*/") for place in sorted(folder.glob(pattern))]
-    if (folder / "database.db").is_file():
-        return (
-            f"{folder}: no camera poses found; database.db has COLMAP's features and matches, but no poses: run "
-            f"`colmap mapper`, which writes sparse/0, or: compgs reconstruct {shlex.quote(str(folder))} -o SCENE"
-        )
-    others = [file for pattern in POSES_OF_OTHERS for file in sorted(folder.glob(pattern))]
-    if others:
-        return (
-            f"{folder}: {others[0].relative_to(folder)} is not read: poses of {POSES_OF_OTHERS[_pattern(others[0])]}; "
-            f"export them from there for COLMAP (sparse/0) or nerfstudio (transforms.json), beside {IMAGES}/"
-        )
-    inside = [p for p in deeper if find_sparse_model(p) == p or (p / "transforms.json").is_file()]
-    if inside:
-        way = f"; there are some in {inside[0].relative_to(folder)}/"
-        return (
-            f"{folder}: no camera poses found where they are expected: a COLMAP sparse model in sparse/0, "
-            f"{SPLIT_FILE} or transforms.json{way}: name the folder of that scene, or put it there, beside {IMAGES}/"
-        )
-    return (
-        f"{folder}: no camera poses found; expected a COLMAP sparse model (cameras.bin, images.bin and "
-        f"points3D.bin in sparse/0), transforms_train.json (Blender) or transforms.json (nerfstudio). "
-        f"For photographs alone, or a video, run: compgs reconstruct {shlex.quote(str(folder))} -o SCENE"
-    )
-
-
-def _check_there(capture: Capture, folder: Path, images: str) -> None:
-    """Raises UnreadableImage where photographs are missing that lie in another folder inside the scene's."""
-    missing = [posed for posed in capture.images if not posed.path.is_file()]
-    if not missing:
-        return
-    names, wanted = Names(), PurePosixPath(missing[0].name)
-    for place in sorted(path for path in folder.iterdir() if path.is_dir()):
-        if any(names.find(place, str(name)) for name in (wanted, wanted.name)):
-            raise UnreadableImage(
-                f"{missing[0].path}: this view's image does not exist; {place.name}/ has one of that name: name that "
-                f"folder with images=..., or rename it to {images}"
-            )
 
 
 def _check_views(capture: Capture, folder: Path) -> None:
@@ -240,65 +168,6 @@ def _check_views(capture: Capture, folder: Path) -> None:
             )
     if len(names) < 2:
         raise SceneError(f"{folder}: {len(names)} view with a pose; a scene needs at least 2")
-
-
-def _turned(capture: Capture) -> Capture:
-    """With images turned by their orientation tag where their cameras are of turned ones, and a sentence about it."""
-    images = turned_as_cameras_are(capture.images)
-    count = sum(posed.turned for posed in images)
-    if not count:
-        return capture
-    note = f"{count} of {len(images)} photographs are turned by their orientation tag: so their cameras are"
-    return replace(capture, images=images, notes=(*capture.notes, note))
-
-
-def _sized(
-    capture: Capture, folder: Path, images: str, downscale: int | str
-) -> tuple[Capture, float, tuple[str, ...]]:
-    """The capture, the factor by which its images are to be reduced, and what is to be noted."""
-    if downscale != AUTO:
-        return *_prescaled(capture, folder, images, int(downscale)), ()
-    largest = max(
-        (image_size(posed.path) for posed in capture.images if posed.path.is_file()),
-        key=lambda size: size[0] * size[1],
-        default=(1, 1),
-    )
-    if largest[0] * largest[1] <= LARGE or max(largest) <= LONGEST_SIDE:
-        return capture, 1, ()
-    factor = max(largest) / LONGEST_SIDE
-    width, height = downscaled_size(largest, factor)
-    note = (
-        f"photographs of {largest[0]} x {largest[1]} pixels are read at {width} x {height} (downscale=auto); "
-        "downscale=1 reads all their pixels"
-    )
-    return capture, factor, (note,)
-
-
-def _prescaled(capture: Capture, folder: Path, images: str, downscale: int) -> tuple[Capture, int]:
-    """Takes the images from `images_<downscale>` where that folder has all of them in the promised size."""
-    smaller = folder / f"{images}_{downscale}"
-    if downscale == 1 or not smaller.is_dir():
-        return capture, downscale
-    swapped, names = [], Names()
-    for posed in capture.images:
-        if not posed.path.is_relative_to(folder / images):
-            return capture, downscale
-        name = posed.path.relative_to(folder / images).as_posix()
-        path = names.find(smaller, name)
-        if path is None or not _is_smaller_copy(posed, path, downscale):
-            note = f"{smaller.name} is not used: {Path(name).name} is missing there or not 1/{downscale} of its size"
-            return replace(capture, notes=(*capture.notes, note)), downscale
-        swapped.append(replace(posed, path=path, turned=False))
-    return replace(capture, images=turned_as_cameras_are(swapped)), 1
-
-
-def _is_smaller_copy(posed: PosedImage, path: Path, downscale: int) -> bool:
-    size, sideways = stored_size(path)
-    camera = posed.camera
-    return any(
-        abs(width - camera.width / downscale) <= 1 and abs(height - camera.height / downscale) <= 1
-        for width, height in (size, size[::-1])[: 1 + sideways]
-    )
 
 
 def _held_out(
