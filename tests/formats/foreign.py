@@ -1,11 +1,16 @@
 """Files as other programs write them, made from known numbers by their layouts alone."""
 
 import base64
+import io
 import json
 import struct
+import zipfile
 from typing import Any
 
 import numpy as np
+from PIL import Image
+
+from compgs.formats.arrays import harmonics_above_dc
 
 
 def text_ply(binary: bytes, *, end: str = "\n") -> bytes:
@@ -148,3 +153,48 @@ def gltf_file(glb: bytes, uri: str | None = None) -> bytes:
         uri or "data:application/octet-stream;base64," + base64.b64encode(data).decode()
     )
     return json.dumps(gltf, indent=2).encode()
+
+
+SOG_COUNT, PALETTE_ROWS = 3, 2
+
+
+def webp(pixels: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels.astype(np.uint8)).save(buffer, "WEBP", lossless=True, exact=True)
+    return buffer.getvalue()
+
+
+def sog_first_bytes(degree: int) -> dict[str, np.ndarray]:
+    """Bytes of every image."""
+    chance = np.random.default_rng(degree)
+    pixels = {name: chance.integers(0, 256, (1, SOG_COUNT, 3)) for name in ("low", "high", "scales")}
+    pixels["colors"] = chance.integers(0, 256, (1, SOG_COUNT, 4))
+    pixels["rotations"] = np.array([[[128, 128, 255, 253], [0, 128, 128, 252], [90, 100, 110, 255]]])
+    pixels["palette"] = chance.integers(0, 256, (PALETTE_ROWS, 64 * harmonics_above_dc(degree), 3))
+    pixels["labels"] = np.array(
+        [[[64, 0, 0], [127, 0, 0], [3, 0, 0]]]
+    )  # 0, 63 of the second row; 3 of the first
+    return pixels
+
+
+def sog_first_files(degree: int) -> dict[str, bytes]:
+    pixels = sog_first_bytes(degree)
+    meta: dict[str, Any] = {
+        "means": {"shape": [SOG_COUNT, 3], "mins": [-1, 0, -2], "maxs": [1, 2, 0], "files": ["low.webp", "high.webp"]},
+        "scales": {"shape": [SOG_COUNT, 3], "mins": [-5, -4, -3], "maxs": [-1, -2, -3], "files": ["scales.webp"]},
+        "quats": {"shape": [SOG_COUNT, 4], "encoding": "quaternion_packed", "files": ["rotations.webp"]},
+        "sh0": {"shape": [SOG_COUNT, 1, 4], "mins": [-2, -1, 0, -8], "maxs": [2, 1, 1, 6], "files": ["colors.webp"]},
+    }  # fmt: skip
+    if degree:
+        names = ["palette.webp", "labels.webp"]
+        meta["shN"] = {"mins": -0.5, "maxs": 1.0, "quantization": 8, "files": names}
+    images = {f"{name}.webp": webp(array) for name, array in pixels.items() if array.size}
+    return {"meta.json": json.dumps(meta).encode(), **images}
+
+
+def zipped(files: dict[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return buffer.getvalue()

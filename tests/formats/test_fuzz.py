@@ -16,7 +16,7 @@ from compgs.formats import splat as splat_format
 from compgs.formats import spz as spz_format
 from compgs.formats.arrays import drawable
 
-from .foreign import CompressedPly, gltf_file, ksplat_file, text_ply
+from .foreign import CompressedPly, gltf_file, ksplat_file, sog_first_files, text_ply, zipped
 
 READERS = {
     "ply": ply_format,
@@ -29,6 +29,7 @@ READERS = {
     "compressed": ply_compressed,
     "ksplat": ksplat_format,
     "gltf": gltf_format,
+    "sog1": sog_format,
 }
 ROUNDS = 250
 
@@ -41,6 +42,8 @@ def whole(made, name: str) -> bytes:
         return text_ply(encoded(made(9, 1), "ply"))
     if name == "compressed":
         return CompressedPly(300, 1).content()
+    if name == "sog1":
+        return zipped(sog_first_files(2))
     if name == "gltf":
         return gltf_file(encoded(made(9, 1), "glb"))
     if name == "ksplat":

@@ -75,8 +75,9 @@ def test_what_we_write_looks_the_same_to_splat_transform(
         ("spz", ["--spz-version", "4"], 35.0),
         ("glb", [], 90.0),
         ("sog", ["--gpu", "cpu"], 28.0),
+        ("compressed.ply", [], 40.0),
     ],
-    ids=["spz3", "spz4", "glb", "sog"],
+    ids=["spz3", "spz4", "glb", "sog", "compressed.ply"],
 )
 def test_what_splat_transform_writes_looks_the_same_to_us(
     scene: SplatArrays, tmp_path: Path, suffix: str, options: list[str], least: float
@@ -87,6 +88,23 @@ def test_what_splat_transform_writes_looks_the_same_to_us(
     original.write_bytes(encoded(scene, "ply"))
     theirs = transformed(original, tmp_path / f"theirs.{suffix}", *options)
     assert likeness(theirs, original) >= least
+
+
+@needs_program
+def test_levels_that_splat_transform_writes_are_opened_one_by_one(made, tmp_path: Path) -> None:
+    sources = []
+    for level, count in enumerate((300, 60)):
+        sources.append(tmp_path / f"{level}.ply")
+        sources[-1].write_bytes(encoded(made(count, 1, level), "ply"))
+    written = tmp_path / "levels" / "lod-meta.json"
+    tagged = [str(sources[0]), "-l", "0", str(sources[1]), "-l", "1"]
+    command = [str(PROGRAM), "--overwrite", "--quiet", "--gpu", "cpu", *tagged, str(written)]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+    for level, source in enumerate(sources):
+        model, original = open_scene(written, level=level), open_scene(source)
+        assert model.counts == original.counts
+        ours, theirs = (np.sort(each.bounds[0], axis=0) for each in (model, original))
+        np.testing.assert_allclose(ours, theirs, atol=2e-3)
 
 
 @needs_program

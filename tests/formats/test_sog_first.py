@@ -1,6 +1,5 @@
 """The first version of .sog: images taken apart by hand, and damage that is named."""
 
-import io
 import json
 import zipfile
 from collections.abc import Callable
@@ -9,49 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from compgs.errors import SplatFileError
 from compgs.formats import format_of, sog
 from compgs.formats.arrays import harmonics_above_dc
 
+from .foreign import SOG_COUNT, sog_first_bytes, sog_first_files, webp
+
 CASE = Path(__file__).parents[3] / "shared" / "cases" / "sog_v1_meta" / "meta.json"
-COUNT, ROWS = 3, 2  # splats; of the palette
 Files = dict[str, bytes]
-
-
-def image(pixels: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels.astype(np.uint8)).save(buffer, "WEBP", lossless=True, exact=True)
-    return buffer.getvalue()
-
-
-def stored(degree: int) -> dict[str, np.ndarray]:
-    """Bytes of every image."""
-    chance = np.random.default_rng(degree)
-    pixels = {name: chance.integers(0, 256, (1, COUNT, 3)) for name in ("low", "high", "scales")}
-    pixels["colors"] = chance.integers(0, 256, (1, COUNT, 4))
-    pixels["rotations"] = np.array([[[128, 128, 255, 253], [0, 128, 128, 252], [90, 100, 110, 255]]])
-    pixels["palette"] = chance.integers(0, 256, (ROWS, 64 * harmonics_above_dc(degree), 3))
-    pixels["labels"] = np.array(
-        [[[64, 0, 0], [127, 0, 0], [3, 0, 0]]]
-    )  # 0, 63 of the second row; 3 of the first
-    return pixels
-
-
-def written(degree: int) -> Files:
-    pixels = stored(degree)
-    meta: dict[str, Any] = {
-        "means": {"shape": [COUNT, 3], "mins": [-1, 0, -2], "maxs": [1, 2, 0], "files": ["low.webp", "high.webp"]},
-        "scales": {"shape": [COUNT, 3], "mins": [-5, -4, -3], "maxs": [-1, -2, -3], "files": ["scales.webp"]},
-        "quats": {"shape": [COUNT, 4], "encoding": "quaternion_packed", "files": ["rotations.webp"]},
-        "sh0": {"shape": [COUNT, 1, 4], "mins": [-2, -1, 0, -8], "maxs": [2, 1, 1, 6], "files": ["colors.webp"]},
-    }  # fmt: skip
-    if degree:
-        names = ["palette.webp", "labels.webp"]
-        meta["shN"] = {"mins": -0.5, "maxs": 1.0, "quantization": 8, "files": names}
-    images = {f"{name}.webp": image(array) for name, array in pixels.items() if array.size}
-    return {"meta.json": json.dumps(meta).encode(), **images}
 
 
 def folder(path: Path, files: Files) -> Path:
@@ -67,11 +32,11 @@ def lerp(low: float, high: float, byte: int) -> float:
 
 @pytest.mark.parametrize("degree", range(4))
 def test_a_file_made_by_hand_holds_the_splats_it_describes(tmp_path: Path, degree: int) -> None:
-    path, pixels = folder(tmp_path, written(degree)), stored(degree)
+    path, pixels = folder(tmp_path, sog_first_files(degree)), sog_first_bytes(degree)
     assert format_of(path).name == "sog"
     read = sog.read(path)
-    assert (len(read), read.degree) == (COUNT, degree)
-    for i in range(COUNT):
+    assert (len(read), read.degree) == (SOG_COUNT, degree)
+    for i in range(SOG_COUNT):
         for axis, (low, high) in enumerate([(-1, 1), (0, 2), (-2, 0)]):
             step = int(pixels["low"][0, i, axis]) + 256 * int(pixels["high"][0, i, axis])
             log = low + (high - low) * step / 65535
@@ -98,9 +63,9 @@ def test_a_file_made_by_hand_holds_the_splats_it_describes(tmp_path: Path, degre
 
 
 def test_a_zip_of_the_same_is_read_as_well(tmp_path: Path) -> None:
-    beside, zipped = sog.read(folder(tmp_path, written(2))), tmp_path / "a.sog"
+    beside, zipped = sog.read(folder(tmp_path, sog_first_files(2))), tmp_path / "a.sog"
     with zipfile.ZipFile(zipped, "w") as archive:
-        for name, content in written(2).items():
+        for name, content in sog_first_files(2).items():
             archive.writestr(name, content)
     inside = sog.read(zipped)
     for name, values in beside.columns.items():
@@ -146,7 +111,7 @@ def meta_with(change: Callable[[dict[str, Any]], object]) -> Callable[[Files], N
 def test_a_damaged_file_is_refused_with_what_is_wrong(
     tmp_path: Path, damage: Callable[[Files], None], message: str
 ) -> None:
-    files = written(1)
+    files = sog_first_files(1)
     damage(files)
     path = folder(tmp_path, files)
     with pytest.raises(SplatFileError, match=message) as caught:
@@ -155,8 +120,8 @@ def test_a_damaged_file_is_refused_with_what_is_wrong(
 
 
 def test_a_label_without_an_entry_leaves_its_splat_out(tmp_path: Path) -> None:
-    files = written(1)
-    files["labels.webp"] = image(np.array([[[64, 0, 0], [128, 0, 0], [3, 0, 0]]]))
-    whole = sog.read(folder(tmp_path / "whole", written(1)))
+    files = sog_first_files(1)
+    files["labels.webp"] = webp(np.array([[[64, 0, 0], [128, 0, 0], [3, 0, 0]]]))
+    whole = sog.read(folder(tmp_path / "whole", sog_first_files(1)))
     read = sog.read(folder(tmp_path / "damaged", files))
     assert np.array_equal(read.means, whole.means[[0, 2]])

@@ -78,12 +78,15 @@ def read(path: Path) -> SplatArrays:
     chunks, vertices = _element(path, layout, "chunk"), _element(path, layout, "vertex")
     colors = _parts(vertices["packed_color"], 8, 8, 8, 8)
     ranges = _COLORS if _COLORS[0] in (chunks.dtype.names or ()) else None
+    shown = _between(chunks, ranges, colors[:, :3]).astype(np.float64)
+    with np.errstate(over="ignore"):  # colors that are too large are left out with their splats
+        dc = ((shown - COLOR_OFFSET) / Y0).astype(np.float32)
     found = SplatArrays(
         means=_between(chunks, _POSITIONS, _parts(vertices["packed_position"], 11, 10, 11)),
         log_scales=_between(chunks, _SCALES, _parts(vertices["packed_scale"], 11, 10, 11)),
         quaternions=_rotations(vertices["packed_rotation"]),
         opacity_logits=logit(colors[:, 3]),
-        dc=((_between(chunks, ranges, colors[:, :3]) - COLOR_OFFSET) / Y0).astype(np.float32),
+        dc=dc,
         rest=_harmonics(path, layout),
         antialiased=layout.antialiased,
     )
