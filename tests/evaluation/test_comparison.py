@@ -87,6 +87,20 @@ def test_a_known_change_gives_the_closed_form(walls: tuple[Path, Path]) -> None:
     assert (found.a.bytes, found.b.bytes) == tuple(path.stat().st_size for path in walls)
 
 
+def test_what_a_mask_leaves_out_of_a_photograph_does_not_count(walls: tuple[Path, Path]) -> None:
+    """The left half of the photograph is white, and masked."""
+    scene = photographs([105])
+    pixels, mask = scene.test_views[0].image.copy(), np.ones((HEIGHT, WIDTH), dtype=bool)
+    pixels[:, : WIDTH // 2], mask[:, : WIDTH // 2] = 255, False
+    view = replace(scene.test_views[0], pixels=pixels, counted=mask)
+    found = compare(*walls, scene=replace(scene, test_views=(view,)), device="cpu")
+    assert (found.a.psnr, found.b.psnr) == pytest.approx((db(5), db(5)), abs=1e-6)
+    assert found.psnr == pytest.approx(db(10), abs=1e-6)  # of the whole pictures
+    mask[:] = False
+    with pytest.raises(SceneError, match=r"0\.jpg: its mask leaves no pixel"):
+        compare(*walls, scene=replace(scene, test_views=(view,)), device="cpu")
+
+
 def test_the_worst_view_is_that_in_which_the_two_differ_most(
     tmp_path: Path, random_splats: Callable[..., SplatArrays]
 ) -> None:

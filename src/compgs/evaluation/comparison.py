@@ -51,7 +51,8 @@ from compgs.cameras import Camera
 from compgs.devices import chosen_device, device_name
 from compgs.errors import SceneError, UnsupportedCamera
 from compgs.evaluation.camera_path import camera_entry, read_cameras, surround
-from compgs.evaluation.measure import encode_png, lpips_or_why_not, timed_decode, timed_render
+from compgs.evaluation.held_out import check_held_out
+from compgs.evaluation.measure import compared, encode_png, lpips_or_why_not, timed_decode, timed_render
 from compgs.evaluation.reports.comparison_page import ComparisonPage
 from compgs.evaluation.reports.pictures import difference_picture, levels_between, scale_for
 from compgs.formats import check_scene, component_bytes, format_of, scene_file, scene_name
@@ -337,6 +338,7 @@ def _places(
     if scene is not None:
         if not scene.test_views:
             raise SceneError(f"{scene.name}: no view is held out to compare with; load with hold-out")
+        check_held_out(scene, exposure=False)
         places = [_Place(view.name, view.camera, view) for view in scene.test_views]
         return places, f"held-out views of {scene.name}"
     if cameras is not None:
@@ -379,7 +381,7 @@ def _compared(
         photograph = None if place.view is None else place.view.image
         levels = levels_between(a, b)
         scale = scale_for([levels])
-        a_quality, b_quality = (_quality(image, photograph, network) for image in (a, b))
+        a_quality, b_quality = (_quality(image, place.view, network) for image in (a, b))
         between = None if network is None else metrics.lpips(b, a, network)
         rows.append(
             ComparedView(
@@ -420,13 +422,14 @@ QUALITY = ("psnr", "ssim", "lpips", "lpips_3dgs")  # against the photographs
 
 
 def _quality(
-    image: np.ndarray, photograph: np.ndarray | None, network: metrics.LpipsNetwork | None
+    image: np.ndarray, view: View | None, network: metrics.LpipsNetwork | None
 ) -> dict[str, float | None]:
-    """Against the photograph, where there is one; LPIPS, where there is a network."""
-    if photograph is None:
+    """Against the photograph, where there is one and its mask counts; LPIPS, where there is a network."""
+    if view is None:
         return dict.fromkeys(QUALITY)
-    distances = (None, None) if network is None else metrics.lpips(image, photograph, network)
-    values = (metrics.psnr(image, photograph), metrics.ssim(image, photograph), *distances)
+    seen, photograph, mask = compared(image, view)
+    distances = (None, None) if network is None else metrics.lpips(seen, photograph, network, mask)
+    values = (metrics.psnr(seen, photograph, mask), metrics.ssim(seen, photograph, mask), *distances)
     return dict(zip(QUALITY, values, strict=True))
 
 
