@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from compgs.errors import ConfigError, SplatFileError
+from compgs.errors import ConfigError, NotACompGSFile, SplatFileError
 from compgs.formats import SplatArrays, check_scene, component_bytes, format_of, open_scene, sog, sog_streamed
 
 Meta = dict[str, Any]
@@ -185,3 +185,15 @@ def test_a_deep_tree_is_walked_without_a_deep_stack(scene: Path) -> None:
         content["tree"] = {"children": [content["tree"]]}
     write(scene.parent, content)
     assert len(sog_streamed.read(scene)) == 13
+
+
+def test_what_the_file_says_and_nothing_uses_is_told(scene: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write(scene.parent, {**meta(), "fog": 1, "annotations": []})
+    sog_streamed.read(scene)
+    assert f"{scene}: not used: annotations, fog" in caplog.messages
+
+
+def test_a_folder_is_answered_with_the_file_in_it(scene: Path) -> None:
+    (scene.parent / "meta.json").touch()
+    with pytest.raises(NotACompGSFile, match=r"did you mean .*lod-meta\.json\?"):
+        format_of(scene.parent)

@@ -131,7 +131,8 @@ def format_of(path: Path) -> Format:
     path = scene_file(path)
     names = ", ".join(dict.fromkeys(f".{each.name}" for each in FORMATS[1:]))
     if path.is_dir():
-        files = sorted(path.glob("*.cgs")) or sorted(path.glob("meta.json"))
+        names_inside = "*.cgs", sog_streamed.NAME, "meta.json", "*.gltf"
+        files = [file for pattern in names_inside for file in sorted(path.glob(pattern))]
         hint = f"; did you mean {files[0]}?" if files else ""
         raise NotACompGSFile(f"{path}: expected a .cgs file or one of {names}, found a folder{hint}")
     if not path.is_file():

@@ -24,11 +24,13 @@ import numpy as np
 from compgs.errors import ConfigError, SplatFileError
 from compgs.formats import sog
 from compgs.formats.arrays import SplatArrays, drawable, joined
+from compgs.notes import note
 
 NAME = "lod-meta.json"
 FINEST = 0
 MOST_BYTES = 1 << 28  # of this file
 _MOST_LEVELS = 1 << 10
+_KNOWN = {"version", "asset", "count", "counts", "lodLevels", "environment", "filenames", "tree"}
 _MARKS = (b'"lodLevels"', b'"filenames"')
 _COPY = "copy the whole folder again"
 
@@ -49,6 +51,7 @@ class StreamedScene:
     levels: int
     environment: str | None
     rows: tuple[dict[str, list[Rows]], ...]  # of each level, by the name of the part; they do not overlap
+    unused: tuple[str, ...]  # what the file says, and nothing here uses
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -74,6 +77,8 @@ def read(path: Path, level: int = FINEST) -> SplatArrays:
     """The splats of a level. Raises SplatFileError; ConfigError for a level that is not there."""
     scene = read_meta(path)
     check_level(scene, level)
+    if scene.unused:
+        note(path, f"not used: {', '.join(scene.unused)}")
     found: list[SplatArrays] = []
     for name, ranges in scene.rows[level].items():
         part = sog.splats(_part(scene, name))
@@ -148,7 +153,8 @@ def _scene(path: Path, meta: dict[str, Any]) -> StreamedScene:
             ranges.sort(key=lambda each: each.start)
             if any(one.end > other.start for one, other in itertools.pairwise(ranges)):
                 raise SplatFileError(f"{path}: names splats of {name} twice; {_COPY}")
-    scene = StreamedScene(path, levels, meta.get("environment") or None, rows)
+    unused = tuple(sorted(set(meta) - _KNOWN))
+    scene = StreamedScene(path, levels, meta.get("environment") or None, rows, unused)
     promised = meta.get("counts")
     if promised is not None and list(promised) != list(scene.counts):
         raise SplatFileError(
