@@ -280,10 +280,22 @@ def test_splats_are_fitted_in_smaller_pictures_as_others_draw_them_in_large_ones
     assert exporting.as_others_draw(plain, plain.viewpoints) == RasterSettings(plain.background)
     model = compgs.decode(with_dilation(tiny_cgs, 0.02, tmp_path / "b.cgs"))
     camera = model.viewpoints[0]
-    half = camera.resized(camera.width // 2, camera.height // 2)
+    large = exporting.at_least(exporting.VIEWING_SIDE, camera)
+    assert max(large.width, large.height) == 1280
+    half = camera.resized(large.width // 2, large.height // 2)
     settings = exporting.as_others_draw(model, model.viewpoints)
-    assert settings.dilation_of(camera) == pytest.approx(0.3)
-    assert settings.dilation_of(half) == pytest.approx(0.3 * half.fx * half.fy / (camera.fx * camera.fy))
+    assert settings.dilation_of(large) == pytest.approx(0.3)
+    assert settings.dilation_of(half) == pytest.approx(0.3 / 4, rel=0.01)
+
+
+def test_splats_are_measured_as_people_look_at_them_too(tmp_path: Path, tiny_cgs: Path) -> None:
+    small = compgs.decode(tiny_cgs).viewpoints[0]
+    viewed = exporting.viewing_cameras([small] * 20)
+    assert len(viewed) == 5 and {max(camera.width, camera.height) for camera in viewed} == {1280}
+    assert viewed[0].fx / viewed[0].width == pytest.approx(small.fx / small.width, rel=1e-2)
+    assert exporting.viewing_cameras([exporting.at_least(1280, small)]) == ()
+    done = export(tiny_cgs, tmp_path / "a.ply", degree=1, refine=0)
+    assert len(done.viewing_psnr) == 6 and done.viewing_mean == pytest.approx(np.mean(done.viewing_psnr))
 
 
 def test_who_exports_a_scene_that_is_sharper_than_others_draw_it_is_told(

@@ -41,6 +41,8 @@ HTML = "html"
 FITTED_CAMERAS = 96  # of baking; fewer than the coefficients leave colors between them to chance
 COMPARED_CAMERAS = 12  # between the file's own, beside those: baking saw none of them
 LONGEST_SIDE = 800  # pixels, of cameras that baking looks through
+VIEWING_SIDE = 1280  # pixels, the longer side of pictures as people look at them
+VIEWED_CAMERAS = 6  # that are compared at this size
 SOFTER = 0.5  # of what other programs dilate splats by; who has less is sharper to the eye
 LEAST_DEGREE = 1  # of harmonics, before splats are left out for a file to be small enough
 MOST_STEPS = 100_000  # of refining
@@ -57,12 +59,18 @@ class Exported:
     dropped: int  # splats that were left out for the file to be small enough
     psnr: tuple[float, ...]  # dB, 8-bit images, of each camera; infinite where nothing changed
     origin: tuple[float, float, float]  # world units: where positions in the file count from
+    viewing_psnr: tuple[float, ...] = ()  # dB, at VIEWING_SIDE, where the photographs are smaller than that
     softer: bool = False  # whether other programs draw the splats softer than the scene is
 
     @property
     def mean(self) -> float:
         """dB, of the cameras, as `metrics.mean_psnr` has it."""
         return metrics.mean_psnr(self.psnr)
+
+    @property
+    def viewing_mean(self) -> float:
+        """dB, of pictures as people look at them: of VIEWING_SIDE, or of the photographs' size where that is larger."""
+        return metrics.mean_psnr(self.viewing_psnr or self.psnr)
 
     @property
     def worst(self) -> float:
@@ -127,8 +135,9 @@ def export(
     cameras = own_cameras(model)
     fitted = [smaller(c) for c in (*cameras, *between(cameras, max(0, FITTED_CAMERAS - len(cameras))))]
     compared = (*cameras, *between(cameras, COMPARED_CAMERAS, seed=1))
+    viewed = viewing_cameras(compared)
     changed = limits.change(model)
-    steps = len(compared) + (len(fitted) + refine if changed else 0)
+    steps = len(compared) + len(viewed) + (len(fitted) + refine if changed else 0)
     settings = as_others_draw(model, cameras)
     count = _counter(steps, progress)
 
@@ -148,9 +157,13 @@ def export(
         note(path, text)
     again = _read_back(data, kind, model, chosen)
     psnr = tuple(_compared(model, again, compared, count))
+    viewing_psnr = tuple(_compared(model, again, viewed, count))
     write_bytes(path, data)
-    sharp = settings_of(model).dilation_of(cameras[0]) < SOFTER * settings.dilation_of(cameras[0])
-    return Exported(len(data), again.counts["splats"], baked.splats.degree, dropped, psnr, origin, sharp)
+    # Others add the same number of pixels to pictures of every size.
+    sharp = settings_of(model).dilation_of(cameras[0]) < SOFTER * DEFAULT_SETTINGS.dilation
+    return Exported(
+        len(data), again.counts["splats"], baked.splats.degree, dropped, psnr, origin, viewing_psnr, sharp
+    )
 
 
 @dataclass(frozen=True)
@@ -265,11 +278,30 @@ def own_cameras(model: Renderable) -> list[Camera]:
 
 
 def as_others_draw(model: Renderable, cameras: Sequence[Camera]) -> RasterSettings:
-    """How other programs draw splats in pictures of the cameras' size; so that they can be fitted in smaller ones."""
+    """How other programs draw splats in pictures of VIEWING_SIDE; so that they can be fitted in smaller ones.
+
+    They add the same number of pixels in every size. Splats that are fitted as they are drawn in small photographs make
+    up for it, and are wrong in all larger pictures: 38 dB in place of 53.
+    """
     if model.angular_dilation is None:
         return RasterSettings(background=model.background, antialiased=model.antialiased)
-    angle = as_angle(DEFAULT_SETTINGS.dilation, cameras)
+    angle = as_angle(DEFAULT_SETTINGS.dilation, [at_least(VIEWING_SIDE, camera) for camera in cameras])
     return RasterSettings(background=model.background, angular_dilation=angle)
+
+
+def viewing_cameras(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """Some of the cameras in the size in which people look at pictures; none, where theirs is as large."""
+    longest = max(max(camera.width, camera.height) for camera in cameras)
+    if longest >= VIEWING_SIDE:
+        return ()
+    chosen = cameras[:: max(1, -(-len(cameras) // VIEWED_CAMERAS))]
+    return tuple(at_least(VIEWING_SIDE, camera) for camera in chosen)
+
+
+def at_least(side: int, camera: Camera) -> Camera:
+    """The same view, its longer side of so many pixels at least."""
+    grow = max(1.0, side / max(camera.width, camera.height))
+    return camera.resized(round(camera.width * grow), round(camera.height * grow))
 
 
 def smaller(camera: Camera) -> Camera:

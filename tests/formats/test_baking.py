@@ -228,7 +228,7 @@ def test_refining_comes_nearer_to_the_scene_where_nothing_was_fitted(
     baked = bake(model, cameras, 1)
     others = between(cameras, 6)
     refined = refine(baked, model, cameras, 80)
-    assert psnr(model, refined, others) > psnr(model, baked, others) + 0.5
+    assert psnr(model, refined, others) > psnr(model, baked, others) + 0.3
     assert np.array_equal(refined.splats.means, baked.splats.means)
     assert not np.array_equal(refined.splats.dc, baked.splats.dc)
 

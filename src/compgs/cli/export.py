@@ -100,8 +100,12 @@ def report(source: Path, path: Path, exported: "Exported") -> list[str]:
     else:
         lines.append(
             f"beside {source.name}: {exported.mean:.2f} dB, {exported.worst:.2f} dB from the worst of "
-            f"{len(exported.psnr)} cameras"
+            f"{len(exported.psnr)} cameras, in pictures as large as its photographs"
         )
+        if exported.viewing_psnr:
+            lines.append(
+                f"beside it as people look at it, 1,280 pixels across: {exported.viewing_mean:.2f} dB"
+            )
     if exported.dropped:
         total = exported.splats + exported.dropped
         advice = "; a lower --degree leaves room for more of them" if exported.degree else ""

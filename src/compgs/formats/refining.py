@@ -13,8 +13,9 @@ from compgs.model.spherical_harmonics import view_colors, view_colors_gradient
 from compgs.model.splats import SplatArrays, sigmoid, splat_radii
 from compgs.render import RasterSettings, Renderable, blend_of, local_camera, render, visible_mask
 
-# Learning rates at the beginning; they fall to LAST_RATE of it. Three times more shakes what was right already.
-RATES = {"opacity_logits": 0.02, "dc": 0.005, "rest": 0.002}
+# Learning rates at the beginning; they fall to LAST_RATE of it. Four times more shakes what was right already: in
+# pictures of 1 280 pixels, where baking alone is 46 to 54 dB from the scene, it loses up to 2 dB; these gain 0.4 dB.
+RATES = {"opacity_logits": 0.005, "dc": 0.00125, "rest": 0.0005}
 LAST_RATE = 0.1
 
 
@@ -29,8 +30,8 @@ def refine(
 ) -> Baked:
     """The same splats, with opacities and harmonics fitted to the model's own renderings, mean squared error.
 
-    400 steps leave 0.02 dB of the 0.15 to 0.2 dB that baking alone loses against photographs. Cameras are taken in a
-    fixed order; their pictures are kept. Geometry stays: it is that of the model, and fitting it too gains nothing.
+    Cameras are taken in a fixed order; their pictures are kept. Geometry stays: it is that of
+    the model, and fitting it too gains nothing.
     """
     settings = settings or RasterSettings(background=model.background)
     splats = baked.splats
