@@ -1,6 +1,8 @@
 /** What page and worker say to each other. Everything is in the local frame of the scene. */
 
 import type { Viewpoints } from "../src/codec/viewpoints.ts";
+import type { FirstView } from "./first_view.ts";
+import type { Vector } from "./pose.ts";
 
 /** Where splats are seen from, as far as the worker needs it. */
 export interface Eye {
@@ -15,6 +17,8 @@ export type ToWorker =
   | { kind: "bytes"; bytes: ArrayBuffer }
   | { kind: "url"; url: string }
   | { kind: "eye"; eye: Eye }
+  /** What is along this ray? `direction` has length one; `pixel`: angle of a pixel, radians. */
+  | { kind: "pick"; id: number; origin: Vector; direction: Vector; pixel: number }
   /** The renderer is a new one, and has nothing of the scene. */
   | { kind: "again" };
 
@@ -34,7 +38,9 @@ export interface SceneInfo {
 
 export type FromWorker =
   | { kind: "progress"; loaded: number; total: number | null }
-  | { kind: "scene"; info: SceneInfo }
+  | { kind: "scene"; info: SceneInfo; first: FirstView }
+  /** World units along the ray, null where there is nothing. */
+  | { kind: "picked"; id: number; distance: number | null }
   | { kind: "geometry"; planes: Float32Array<ArrayBuffer>; rows: number }
   /** Primitives to draw, the farthest first; colors and opacities of some rows of them. */
   | {
@@ -46,4 +52,5 @@ export type FromWorker =
       settled: boolean;
     }
   | { kind: "complete"; bytes: number }
-  | { kind: "error"; name: string; message: string };
+  /** `head`: the first bytes of the file, as far as there are any. */
+  | { kind: "error"; name: string; message: string; head: Uint8Array };

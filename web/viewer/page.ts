@@ -1,8 +1,12 @@
 /** The page: a scene that is embedded in it, named by ?url=, chosen, or dropped onto it. */
 
+import { whatItIs } from "./kinds.ts";
 import type { SceneInfo } from "./messages.ts";
 import type { RendererName } from "./renderer.ts";
 import { Viewer } from "./viewer.ts";
+
+const HINT_TIME = 8000; // ms
+const CALM = "2b2f36"; // behind scenes whose own background is black
 
 const element = (id: string): HTMLElement => document.getElementById(id)!;
 
@@ -33,7 +37,12 @@ function sayError(title: string, text: string): void {
   element("bar").hidden = true;
 }
 
-function explain(name: string, message: string): void {
+function explain(name: string, message: string, head?: Uint8Array): void {
+  const other = name === "NotACompGSFile" && head ? whatItIs(head) : null;
+  if (other) {
+    sayError(other.title, other.remedy);
+    return;
+  }
   const titles: Record<string, string> = {
     NotACompGSFile: "This is not a .cgs file",
     UnsupportedVersion: "This file is of another version",
@@ -65,14 +74,25 @@ function askedRenderer(): RendererName | undefined {
 
 function start(): void {
   let described = "";
+  let isShown = false;
+  const hint = new Hint(element("hint"));
   const viewer = new Viewer(element("view"), {
     renderer: askedRenderer(),
+    keys: window,
+    onMove() {
+      hint.fade();
+      sayMode(viewer);
+    },
     onProgress(loaded, total) {
       element("bar").hidden = total !== null && loaded >= total;
       element("bar").style.width = total ? `${(100 * loaded) / total}%` : "100%";
     },
     onScene(info) {
       described = describe(info);
+      if (!isShown) hint.show(hintFor(viewer));
+      isShown = true;
+      sayMode(viewer);
+      setBackground(viewer, info);
       element("status").textContent = described;
       element("welcome").hidden = true;
       element("buttons").hidden = false;
@@ -84,13 +104,20 @@ function start(): void {
     },
     onError: explain,
   });
+  const close = (): void => {
+    element("error").hidden = true;
+    element("welcome").hidden = isShown;
+  };
   Object.assign(window, { compgsViewer: viewer });
   const open = (source: ArrayBuffer | Uint8Array | string): void => {
     element("error").hidden = true;
     element("welcome").hidden = true;
+    isShown = false;
     viewer.open(source);
   };
-  wireButtons(viewer);
+  noteHands();
+  wireButtons(viewer, close);
+  wirePanel(viewer);
   wireFiles(open);
   const data = embedded();
   const url = new URLSearchParams(location.search).get("url");
@@ -101,10 +128,93 @@ function start(): void {
   } else element("welcome").hidden = false;
 }
 
-function wireButtons(viewer: Viewer): void {
+/** Says something for a while. */
+class Hint {
+  private waiting: ReturnType<typeof setTimeout> | undefined;
+
+  constructor(private readonly place: HTMLElement) {}
+
+  show(text: string): void {
+    this.place.textContent = text;
+    this.place.classList.remove("gone");
+    clearTimeout(this.waiting);
+    this.waiting = setTimeout(() => this.fade(), HINT_TIME);
+  }
+
+  fade(): void {
+    this.place.classList.add("gone");
+  }
+}
+
+function hintFor(viewer: Viewer): string {
+  const turn = viewer.controls.mode === "orbit" ? "turn" : "look around";
+  return document.body.classList.contains("touch")
+    ? `One finger to ${turn}, two to move, double tap to turn about a point`
+    : `Drag to ${turn}, wheel to come nearer, W A S D to move; ? has more`;
+}
+
+/** Which controls are spoken of: those of the hand that was last seen. */
+function noteHands(): void {
+  const note = (isTouch: boolean): void => {
+    document.body.classList.toggle("touch", isTouch);
+    document.body.classList.toggle("mouse", !isTouch);
+  };
+  note(matchMedia("(pointer: coarse)").matches);
+  addEventListener("pointerdown", (event) => note(event.pointerType === "touch"), true);
+}
+
+function sayMode({ controls }: Viewer): void {
+  element("mode").textContent = controls.mode === "orbit" ? "Orbit" : "Look around";
+}
+
+/** Where a scene ends there is no black hole: what it has nothing to say about is calm, unless black was chosen. */
+function setBackground(viewer: Viewer, { background }: SceneInfo): void {
+  const select = element("background") as HTMLSelectElement;
+  if (!select.dataset.chosen) select.value = background.every((x) => x === 0) ? CALM : "";
+  applyBackground(viewer, select.value);
+}
+
+function applyBackground(viewer: Viewer, color: string): void {
+  const parts = [0, 2, 4].map((at) => parseInt(color.slice(at, at + 2), 16) / 255);
+  viewer.background = color ? (parts as [number, number, number]) : null;
+}
+
+function wirePanel(viewer: Viewer): void {
+  const lens = element("lens") as HTMLInputElement;
+  const background = element("background") as HTMLSelectElement;
+  const toggle = (isOpen = element("help").hidden): void => {
+    element("help").hidden = !isOpen;
+    lens.value = String(Math.round(viewer.fieldOfView));
+  };
+  element("ask").onclick = () => toggle();
+  element("shut").onclick = () => toggle(false);
+  lens.oninput = () => (viewer.fieldOfView = Number(lens.value));
+  background.onchange = () => {
+    background.dataset.chosen = "yes";
+    applyBackground(viewer, background.value);
+  };
+  addEventListener("keydown", (event) => {
+    if (event.key === "?") toggle();
+    else if (event.key === "Escape") toggle(false);
+  });
+}
+
+async function savePicture(viewer: Viewer): Promise<void> {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(await viewer.screenshot());
+  link.download = `${document.title || "scene"}.png`;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+function wireButtons(viewer: Viewer, close: () => void): void {
   const toggleMode = (): void => {
     viewer.controls.mode = viewer.controls.mode === "orbit" ? "fly" : "orbit";
-    element("mode").textContent = viewer.controls.mode === "orbit" ? "Orbit" : "Fly";
+    sayMode(viewer);
+  };
+  const start = (): void => {
+    viewer.goToStart();
+    sayMode(viewer);
   };
   const toggleScreen = (): void => {
     if (document.fullscreenElement) void document.exitFullscreen();
@@ -113,15 +223,17 @@ function wireButtons(viewer: Viewer): void {
   element("mode").onclick = toggleMode;
   element("screen").onclick = toggleScreen;
   element("next").onclick = () => viewer.nextView();
-  element("start").onclick = () => viewer.goTo(0);
-  element("close").onclick = () => (element("error").hidden = true);
+  element("start").onclick = start;
+  element("picture").onclick = () => void savePicture(viewer);
+  element("close").onclick = close;
   addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || element("buttons").hidden) return;
     const actions: Record<string, () => void> = {
       KeyO: toggleMode,
       KeyF: toggleScreen,
       KeyN: () => viewer.nextView(),
-      KeyR: () => viewer.goTo(0),
+      KeyR: start,
+      KeyP: () => void savePicture(viewer),
     };
     actions[event.code]?.();
   });

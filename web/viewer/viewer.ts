@@ -4,7 +4,9 @@ import type { Camera } from "../src/cameras.ts";
 import { chooseRenderer } from "./choose_renderer.ts";
 import { Controls } from "./controls.ts";
 import type { FromWorker, SceneInfo, ToWorker } from "./messages.ts";
-import { Pose, type Vector, add, dot } from "./pose.ts";
+import type { FirstView } from "./first_view.ts";
+import { Pace } from "./pace.ts";
+import { Pose, type Vector, add, dot, unit } from "./pose.ts";
 import type { FrameCamera, Renderer, RendererName } from "./renderer.ts";
 import workerSource from "compgs:worker";
 
@@ -18,10 +20,18 @@ export interface ViewerOptions {
   /** All bytes are there and sound. */
   onComplete?: (bytes: number) => void;
   /** The file is damaged, or cannot be had: what has been shown of it stays. Or nothing can be drawn (CannotDraw). */
-  onError?: (name: string, message: string) => void;
+  onError?: (name: string, message: string, head?: Uint8Array) => void;
+  /** Somebody has moved. */
+  onMove?: () => void;
+  /** Where keys are listened to: the window, for a page that is nothing but the scene; else the element alone. */
+  keys?: HTMLElement | Window;
 }
 
 const MOST_PIXELS_PER_CSS_PIXEL = 2;
+const REST = 250; // ms without movement, after which the picture becomes sharp
+const MOST_CUT = 1.35; // of a viewpoint's picture, by which it is enlarged to fill a window of another shape
+const LEAST_LENS = 0.2; // of a focal length, as the scene has it
+const MOST_LENS = 5;
 const FIELD_OF_VIEW = 0.9; // radians, of the smaller side, for files without viewpoints
 
 export class Viewer {
@@ -42,6 +52,16 @@ export class Viewer {
   /** A camera that stays until the controls move: its picture has exactly its size. */
   private fixed: Camera | null = null;
   private isTouched = false;
+  /** Pictures are smaller while somebody moves and frames take too long. */
+  private readonly pace = new Pace();
+  private isMoving = false;
+  private lastFrame = -Infinity;
+  private atRest: ReturnType<typeof setTimeout> | undefined;
+  private first: FirstView = { view: 0, isInside: false };
+  private lens = 1;
+  private ownBackground: [number, number, number] | null = null;
+  private picks = new Map<number, (distance: number | null) => void>();
+  private pickId = 0;
   private isDisposed = false;
 
   constructor(
@@ -51,7 +71,11 @@ export class Viewer {
     this.stage = document.createElement("div");
     this.stage.style.cssText = "width:100%;height:100%;outline:none";
     container.append(this.stage);
-    this.controls = new Controls(this.stage, () => this.move());
+    this.controls = new Controls(this.stage, {
+      moved: () => this.move(),
+      pointed: (x, y) => void this.turnAbout(x, y),
+      ...(options.keys ? { keys: options.keys } : {}),
+    });
     this.worker = new Worker(URL.createObjectURL(new Blob([workerSource], { type: "text/javascript" })));
     // The file is decoded in the meantime.
     const isReady = this.equip(options.renderer);
@@ -72,6 +96,7 @@ export class Viewer {
   open(source: ArrayBuffer | Uint8Array | string): void {
     this.info = null;
     this.view = 0;
+    this.controls.rest();
     this.controls.target = null;
     this.fixed = null;
     this.isTouched = false;
@@ -85,6 +110,7 @@ export class Viewer {
 
   dispose(): void {
     this.worker.terminate();
+    clearTimeout(this.atRest);
     this.controls.dispose();
     this.observer.disconnect();
     this.stage.remove();
@@ -100,8 +126,73 @@ export class Viewer {
     this.fixed = null;
     const count = info.viewpoints?.views.length ?? 1;
     this.view = ((view % count) + count) % count;
+    this.lens = 1;
+    this.controls.rest();
     this.controls.target = startOf(info, this.view);
-    this.changed();
+    this.resize();
+  }
+
+  /** Goes to the viewpoint that has most of the scene in its picture. */
+  goToStart(): void {
+    this.controls.mode = this.first.isInside ? "fly" : "orbit";
+    this.goTo(this.first.view);
+  }
+
+  /** Degrees that the smaller side of the picture takes in, from 5 to 150. */
+  get fieldOfView(): number {
+    const camera = this.frameCamera();
+    if (!camera || !this.canvas) return 0;
+    const tangent = Math.min(this.canvas.width / camera.fx, this.canvas.height / camera.fy) / 2;
+    return (360 / Math.PI) * Math.atan(tangent);
+  }
+
+  set fieldOfView(degrees: number) {
+    const wanted = Math.tan((Math.PI / 360) * Math.min(Math.max(degrees, 5), 150));
+    const now = Math.tan((Math.PI / 360) * this.fieldOfView);
+    if (!now) return;
+    this.lens = Math.min(Math.max((this.lens * now) / wanted, LEAST_LENS), MOST_LENS);
+    this.move();
+  }
+
+  /** Red, green, blue behind the scene, display values 0 to 1; null: the scene's own. */
+  set background(color: [number, number, number] | null) {
+    this.ownBackground = color;
+    this.draw();
+  }
+
+  /** Turns about what is seen at a place of the element, in CSS pixels; false where nothing is there. */
+  async turnAbout(x: number, y: number): Promise<boolean> {
+    const { canvas, controls, stage } = this;
+    const camera = this.frameCamera();
+    if (!camera || !canvas || !controls.target || this.fixed) return false;
+    const { pose } = controls.target;
+    const column = ((x / stage.clientWidth) * canvas.width - camera.cx) / camera.fx;
+    const row = ((y / stage.clientHeight) * canvas.height - camera.cy) / camera.fy;
+    const direction = unit(add(add(pose.forward, pose.right, column), pose.down, row));
+    const origin: Vector = [...pose.centre];
+    const id = ++this.pickId;
+    const distance = await new Promise<number | null>((resolve) => {
+      this.picks.set(id, resolve);
+      this.send({ kind: "pick", id, origin, direction, pixel: 0.5 / camera.fx });
+    });
+    if (distance === null) return false;
+    controls.turnAbout(add(origin, direction, distance));
+    return true;
+  }
+
+  /** The picture that is shown, as PNG, sharp. */
+  async screenshot(): Promise<Blob> {
+    await this.settled();
+    this.isMoving = false;
+    this.fit();
+    const camera = this.frameCamera();
+    if (!camera || !this.renderer) throw new Error("There is no scene to take a picture of.");
+    // Browsers keep what is drawn for the task that has drawn it.
+    this.drawNow(this.renderer, camera);
+    const { canvas } = this.renderer;
+    return new Promise((resolve, reject) => {
+      canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("The browser gives no picture."))));
+    });
   }
 
   nextView(): void {
@@ -166,7 +257,24 @@ export class Viewer {
   private move(): void {
     this.fixed = null;
     this.isTouched = true;
+    this.isMoving = true;
+    clearTimeout(this.atRest);
+    this.atRest = setTimeout(() => this.rest(), REST);
+    this.options.onMove?.();
     this.resize();
+  }
+
+  /** Nobody moves: the picture becomes sharp. */
+  private rest(): void {
+    clearTimeout(this.atRest);
+    if (this.controls.isBusy) {
+      this.atRest = setTimeout(() => this.rest(), REST);
+      return;
+    }
+    this.isMoving = false;
+    this.lastFrame = -Infinity;
+    this.fit();
+    this.draw();
   }
 
   private send(message: ToWorker, transfer: Transferable[] = []): void {
@@ -177,12 +285,19 @@ export class Viewer {
     const { options, renderer } = this;
     if (message.kind === "progress") options.onProgress?.(message.loaded, message.total);
     else if (message.kind === "complete") options.onComplete?.(message.bytes);
-    else if (message.kind === "error") options.onError?.(message.name, message.message);
-    else if (message.kind === "scene") {
+    else if (message.kind === "error") options.onError?.(message.name, message.message, message.head);
+    else if (message.kind === "picked") {
+      this.picks.get(message.id)?.(message.distance);
+      this.picks.delete(message.id);
+    } else if (message.kind === "scene") {
+      const isNew = !this.info;
       this.info = message.info;
+      this.controls.place = message.info;
       if (renderer) setScene(renderer, message.info);
+      if (isNew) this.first = message.first;
       this.controls.target ??= startOf(message.info, this.view);
-      if (!this.isTouched) this.goTo(this.view);
+      if (!this.isTouched && isNew) this.goToStart();
+      else if (!this.isTouched) this.goTo(this.view);
       else this.changed();
       options.onScene?.(message.info);
     } else if (!renderer) return;
@@ -191,6 +306,7 @@ export class Viewer {
       if (message.appearance) renderer.setAppearance(message.appearance, message.firstRow);
       renderer.setOrder(message.order);
       if (message.settled) this.settledId = message.id;
+      this.fit();
       this.draw();
     }
   }
@@ -206,14 +322,22 @@ export class Viewer {
   }
 
   private resize(): void {
+    if (!this.canvas) return;
+    this.fit();
+    this.changed();
+  }
+
+  /** Gives the picture the size that it has now: less than it could have, while there is no time for more. */
+  private fit(): void {
     const { canvas, fixed, stage } = this;
     if (!canvas) return;
-    const ratio = Math.min(devicePixelRatio, MOST_PIXELS_PER_CSS_PIXEL);
+    const isUnfinished = this.isMoving || this.settledId !== this.eyeId;
+    const share = isUnfinished ? this.pace.share : 1;
+    const ratio = share * Math.min(devicePixelRatio, MOST_PIXELS_PER_CSS_PIXEL);
     const width = fixed ? fixed.width : Math.max(1, Math.round(stage.clientWidth * ratio));
     const height = fixed ? fixed.height : Math.max(1, Math.round(stage.clientHeight * ratio));
     if (canvas.width !== width) canvas.width = width;
     if (canvas.height !== height) canvas.height = height;
-    this.changed();
   }
 
   /** The camera has changed: the worker hears of it, and what is there is drawn from it at once. */
@@ -236,11 +360,28 @@ export class Viewer {
     this.isDrawing = true;
     requestAnimationFrame(() => {
       this.isDrawing = false;
+      this.keepPace();
       const camera = this.frameCamera();
       if (!camera) return;
-      this.renderer?.draw(camera);
+      if (this.renderer) this.drawNow(this.renderer, camera);
       if (this.settledId === this.eyeId) for (const resolve of this.waitingToSettle.splice(0)) resolve();
     });
+  }
+
+  private drawNow(renderer: Renderer, camera: FrameCamera): void {
+    // Cameras that are asked for show the scene as it is.
+    const own = this.fixed ? null : this.ownBackground;
+    renderer.background = own ?? this.info?.background ?? [0, 0, 0];
+    renderer.draw(camera);
+  }
+
+  private keepPace(): void {
+    const now = performance.now();
+    const passed = now - this.lastFrame;
+    this.lastFrame = now;
+    if (!this.isMoving || this.fixed || passed === Infinity) return;
+    this.pace.took(passed);
+    this.fit();
   }
 
   private frameCamera(): FrameCamera | null {
@@ -250,19 +391,24 @@ export class Viewer {
     if (fixed) return inFrame(fixed, info.worldOffset);
     const { width, height } = canvas;
     const lens = info.viewpoints?.views[this.view];
-    // The whole of the viewpoint's picture is seen, whatever the shape of the window.
     const focal = lens
-      ? Math.min(width / lens.width, height / lens.height)
+      ? fitted(width / lens.width, height / lens.height)
       : Math.min(width, height) / (2 * Math.tan(FIELD_OF_VIEW / 2));
     return {
       rotation: target.pose.rotation,
       translation: target.pose.translation,
-      fx: focal * (lens ? lens.fx : 1),
-      fy: focal * (lens ? lens.fy : 1),
+      fx: this.lens * focal * (lens ? lens.fx : 1),
+      fy: this.lens * focal * (lens ? lens.fy : 1),
       cx: width / 2,
       cy: height / 2,
     };
   }
+}
+
+/** How large a viewpoint's picture is in a window of another shape: cut a little, as nothing is known beyond it. */
+function fitted(across: number, down: number): number {
+  const [whole, full] = [Math.min(across, down), Math.max(across, down)];
+  return whole * Math.min(Math.sqrt(full / whole), MOST_CUT);
 }
 
 /** Tells a renderer what is not of single splats. */

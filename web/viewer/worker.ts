@@ -6,12 +6,17 @@ import { type Appearance, OPACITY_CUTOFF, Predictor } from "../src/prediction/pr
 import { ProgressiveDecoder } from "../src/progressive.ts";
 import { chooseKernels } from "./choose_kernels.ts";
 import { DepthOrder } from "./depth_order.ts";
+import { firstView } from "./first_view.ts";
 import type { Eye, FromWorker, SceneInfo, ToWorker } from "./messages.ts";
+import { distanceAlong } from "./pick.ts";
 import { appearanceRows, geometryPlanes, rowsOf } from "./splat_planes.ts";
 import { NEAR } from "./splatting.ts";
 
 /** Coupled primitives whose opacity and color follow the camera in one frame. */
 const PART = 50_000;
+/** Bytes by which a file that is no .cgs file is known. */
+const HEAD = 16;
+const NO_BYTES = new Uint8Array(0);
 
 interface Shown {
   predictor: Predictor;
@@ -39,8 +44,16 @@ self.onmessage = ({ data }) => {
   if (data.kind === "bytes") void open(++opened, streamOf(new Uint8Array(data.bytes)), data.bytes.byteLength);
   else if (data.kind === "url") void openUrl(++opened, data.url);
   else if (data.kind === "eye") setEye(data.eye);
+  else if (data.kind === "pick") pick(data);
   else if (shown) present(shown);
 };
+
+function pick({ id, origin, direction, pixel }: Extract<ToWorker, { kind: "pick" }>): void {
+  const { predictor, appearance } = shown!;
+  const { opacities } = appearance;
+  const distance = distanceAlong(origin, direction, pixel, predictor.geometry, opacities, NEAR);
+  self.postMessage({ kind: "picked", id, distance });
+}
 
 function setEye(next: Eye): void {
   const moved = !eye || next.centre.some((x, axis) => x !== eye!.centre[axis]);
@@ -61,7 +74,7 @@ async function openUrl(ticket: number, url: string): Promise<void> {
     const length = Number(response.headers.get("Content-Length")) || null;
     await open(ticket, response.body!, response.headers.get("Content-Encoding") ? null : length);
   } catch (error) {
-    report(ticket, error);
+    report(ticket, error, NO_BYTES);
   }
 }
 
@@ -75,6 +88,7 @@ function streamOf(bytes: Uint8Array): ReadableStream<Uint8Array> {
 }
 
 async function open(ticket: number, stream: ReadableStream<Uint8Array>, total: number | null): Promise<void> {
+  let head = NO_BYTES;
   try {
     const chosen = await kernels;
     const decoder = new ProgressiveDecoder(chosen);
@@ -84,6 +98,7 @@ async function open(ticket: number, stream: ReadableStream<Uint8Array>, total: n
       const { done, value } = await reader.read();
       if (ticket !== opened) return;
       if (done) break;
+      if (!loaded) head = value.slice(0, HEAD);
       loaded += value.length;
       const isFiner = decoder.push(value);
       self.postMessage({ kind: "progress", loaded, total: total ?? decoder.expectedBytes });
@@ -92,20 +107,22 @@ async function open(ticket: number, stream: ReadableStream<Uint8Array>, total: n
     decoder.finish();
     self.postMessage({ kind: "complete", bytes: loaded });
   } catch (error) {
-    report(ticket, error);
+    report(ticket, error, head);
   }
 }
 
-function report(ticket: number, error: unknown): void {
+function report(ticket: number, error: unknown, head: Uint8Array): void {
   if (ticket !== opened) return;
   const { name, message } = error instanceof Error ? error : new Error(String(error));
-  self.postMessage({ kind: "error", name, message });
+  self.postMessage({ kind: "error", name, message, head });
 }
 
 function show(scene: Scene, chosen: Kernels): void {
   const predictor = new Predictor(scene, chosen);
   shown = { predictor, appearance: predictor.newAppearance(), nextAnchor: 0, remaining: 0 };
-  self.postMessage({ kind: "scene", info: infoOf(scene, predictor) });
+  const info = infoOf(scene, predictor);
+  const first = firstView(predictor.positions, info.viewpoints, info.extent);
+  self.postMessage({ kind: "scene", info, first });
   present(shown);
 }
 

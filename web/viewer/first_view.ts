@@ -1,0 +1,69 @@
+/** Which of a file's viewpoints a scene is opened from, and whether one looks around there or turns about something. */
+
+import type { Viewpoints } from "../src/codec/viewpoints.ts";
+import { Pose, type Vector, add, dot, unit } from "./pose.ts";
+
+export interface FirstView {
+  /** Number of the viewpoint that has most of the scene in its picture. */
+  view: number;
+  /** The cameras stand in the middle and look outwards: one looks around there. */
+  isInside: boolean;
+}
+
+/** Anchors that are looked at, at most: more say nothing else. */
+const SAMPLES = 4000;
+/** Share of the picture's sides, beyond which an anchor is too near its edge to be counted. */
+const EDGE = 0.02;
+/** Of the mean of directions: cameras that look to all sides have less. */
+const ALL_SIDES = 0.7;
+/** Mean cosine between where a camera looks and where it stands, seen from the middle of all. */
+const OUTWARDS = 0.2;
+/** Of the scene's extent: cameras that stand closer together turn in one place. */
+const ONE_PLACE = 0.25;
+
+/** `positions`: 3 numbers for each anchor. */
+export function firstView(
+  positions: ArrayLike<number>,
+  viewpoints: Viewpoints | null,
+  extent: number,
+): FirstView {
+  if (!viewpoints) return { view: 0, isInside: false };
+  const poses = viewpoints.views.map(({ position, rotation }) => Pose.of([...position] as Vector, rotation));
+  const counts = viewpoints.views.map((lens, i) => seen(positions, poses[i]!, lens));
+  return { view: counts.indexOf(Math.max(...counts)), isInside: looksOutwards(poses, extent) };
+}
+
+interface Lens {
+  width: number;
+  height: number;
+  fx: number;
+  fy: number;
+}
+
+/** Anchors in the picture of a viewpoint, of some that stand for all. */
+function seen(positions: ArrayLike<number>, pose: Pose, { width, height, fx, fy }: Lens): number {
+  const stride = 3 * Math.max(1, Math.floor(positions.length / 3 / SAMPLES));
+  const [across, down] = [((0.5 - EDGE) * width) / fx, ((0.5 - EDGE) * height) / fy];
+  let count = 0;
+  for (let at = 0; at + 2 < positions.length; at += stride) {
+    const offset = add([positions[at]!, positions[at + 1]!, positions[at + 2]!], pose.centre, -1);
+    const depth = dot(offset, pose.forward);
+    if (depth <= 0) continue;
+    const [x, y] = [dot(offset, pose.right) / depth, dot(offset, pose.down) / depth];
+    if (Math.abs(x) < across && Math.abs(y) < down) count++;
+  }
+  return count;
+}
+
+function looksOutwards(poses: Pose[], extent: number): boolean {
+  const mean = (vectors: Vector[]): Vector =>
+    vectors.reduce((sum, vector) => add(sum, vector, 1 / vectors.length), [0, 0, 0] as Vector);
+  if (poses.length < 3) return false;
+  if (Math.hypot(...mean(poses.map(({ forward }) => forward))) > ALL_SIDES) return false;
+  const middle = mean(poses.map(({ centre }) => centre));
+  const offsets = poses.map(({ centre }) => add(centre, middle, -1));
+  const spread = Math.max(...offsets.map((offset) => Math.hypot(...offset)));
+  if (spread < ONE_PLACE * extent) return true;
+  const cosines = poses.map(({ forward }, i) => dot(forward, unit(offsets[i]!)));
+  return cosines.reduce((sum, cosine) => sum + cosine, 0) / cosines.length > OUTWARDS;
+}
