@@ -187,6 +187,38 @@ def test_nerfstudio_points_are_read(nerfstudio: Callable[..., Path], layout: str
 
 
 @pytest.mark.parametrize(
+    ("kind", "names", "white"),
+    [
+        ("uchar", ("red", "green", "blue"), 255),
+        ("ushort", ("red", "green", "blue"), 65535),
+        ("float", ("red", "green", "blue"), 1.0),
+        ("float", ("red", "green", "blue"), 255.0),
+        ("uchar", ("diffuse_red", "diffuse_green", "diffuse_blue"), 255),
+        ("float", ("r", "g", "b"), 1.0),
+    ],
+)
+def test_colors_of_points_are_read_by_their_range(
+    tmp_path: Path, kind: str, names: tuple[str, ...], white: float
+) -> None:
+    header = "ply\nformat ascii 1.0\nelement vertex 3\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "".join(f"property {kind} {name}\n" for name in names) + "end_header\n"
+    shares = np.array([[0, 0, 0], [1, 1, 1], [0.2, 0.4, 0.6]])
+    rows = [
+        " ".join(map(str, [0, 0, i, *(white * share).astype(type(white))])) for i, share in enumerate(shares)
+    ]
+    (tmp_path / "points.ply").write_text(header + "\n".join(rows))
+    np.testing.assert_array_equal(read_ply_points(tmp_path / "points.ply").colors, (255 * shares).astype(int))
+
+
+def test_splats_as_points_have_the_colors_of_their_harmonics(tmp_path: Path) -> None:
+    header = "ply\nformat ascii 1.0\nelement vertex 1\n"
+    header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"))
+    (tmp_path / "points.ply").write_text(header + "end_header\n0 0 0 1.7724539 -1.7724539 0\n")
+    assert read_ply_points(tmp_path / "points.ply").colors.tolist() == [[255, 0, 128]]  # 1.77 is sqrt(pi)
+
+
+@pytest.mark.parametrize(
     "content",
     [
         b"", b"something else", b"ply\nend_header\n",

@@ -20,6 +20,14 @@ _TYPES = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 _GRAY = 128
+HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
+COLOR_NAMES = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+    HARMONICS,
+)
+Y0 = 0.28209479177387814  # 1 / (2 sqrt(pi)): the constant harmonic
 
 
 def read_ply_points(file: Path) -> Points:
@@ -48,13 +56,29 @@ def read_ply_points(file: Path) -> Points:
         raise SceneError(
             f"{file}: vertices with x, y, z were expected ({error}); export them again"
         ) from error
-    if all(name in rows for name in ("red", "green", "blue")):
-        values = np.stack([rows[name] for name in ("red", "green", "blue")], axis=1).astype(np.float64)
-        colors = np.clip(np.nan_to_num(values), 0, 255).astype(np.uint8)
-    else:
-        colors = np.full((count, 3), _GRAY, dtype=np.uint8)
+    colors = _colors(rows, dict(columns), count)
     finite = usable_positions(positions)
     return Points(positions[finite], colors[finite])
+
+
+def _colors(rows: dict[str, np.ndarray], types: dict[str, str], count: int) -> np.ndarray:
+    """[P, 3] uint8, by the range of the values that are there; gray without any.
+
+    Programs write 0 to 255, 0 to 65535 (16 bits) or 0 to 1 (floating point); splats have the constant term of their
+    harmonics.
+    """
+    names = next((found for found in COLOR_NAMES if all(name in rows for name in found)), None)
+    if names is None:
+        return np.full((count, 3), _GRAY, dtype=np.uint8)
+    with np.errstate(invalid="ignore", over="ignore"):
+        values = np.nan_to_num(np.stack([rows[name] for name in names], axis=1).astype(np.float64))
+        if names == HARMONICS:
+            values = 255 * (0.5 + Y0 * values)
+        elif types[names[0]] == "u2":
+            values = values / 257
+        elif types[names[0]].startswith("f") and values.size and values.max() <= 1:
+            values = 255 * values
+        return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
 
 def _header(text: str) -> tuple[str, int, list[tuple[str, str]]]:
