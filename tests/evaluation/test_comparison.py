@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 import compgs
+from compgs import metrics
 from compgs.cameras import Camera
 from compgs.errors import NotACompGSFile, OutputError, SceneError, UnsupportedCamera
 from compgs.evaluation import compare, comparison
@@ -85,6 +86,25 @@ def test_a_known_change_gives_the_closed_form(walls: tuple[Path, Path]) -> None:
     assert 0.9 < found.ssim < 1.0 and found.a.ssim is not None
     assert found.cameras == "held-out views of flat" and found.scene == "flat"
     assert (found.a.bytes, found.b.bytes) == tuple(path.stat().st_size for path in walls)
+
+
+def test_lpips_is_measured_in_both_conventions_between_the_files_and_against_photographs(
+    walls: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Network:
+        def distances(self, a: np.ndarray, b: np.ndarray) -> metrics.LpipsDistances:
+            difference = float(np.abs(a.astype(float) - b).mean())
+            return metrics.LpipsDistances(difference, difference / 2)
+
+    assert compare(*walls, device="cpu").lpips_note == "not asked for"
+    monkeypatch.setattr(metrics, "lpips_network", lambda weights, device: {"weights.npz": Network()}[weights])
+    found = compare(*walls, scene=photographs([105, 90]), lpips="weights.npz", device="cpu")
+    assert (found.lpips, found.lpips_3dgs, found.lpips_note) == (10, 5, None)
+    assert (found.a.lpips, found.a.lpips_3dgs) == (7.5, 3.75) and found.b.lpips == 12.5
+    written = found.to_dict()
+    assert (written["lpips"], written["a"]["lpips_3dgs"]) == (10, 3.75)
+    assert found.per_view_list()[1]["b_lpips"] == 20
+    assert ", LPIPS 10.0000 (as 3DGS measures it 5.0000)" in found.in_words()[0]
 
 
 def test_what_a_mask_leaves_out_of_a_photograph_does_not_count(walls: tuple[Path, Path]) -> None:

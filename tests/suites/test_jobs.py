@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,14 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
 def first_job(suite: Suite, folder: Path) -> Job:
     return jobs_of(suite, folder / "data", folder)[0]
+
+
+def test_options_of_a_suite_are_those_of_the_command_line(suite: Suite, tmp_path: Path) -> None:
+    asked = {"steps": 5, "lpips": True, "flip": False, "lpips_weights": "weights.npz"}
+    command = first_job(replace(suite, train=asked), tmp_path).command
+    assert "--lpips" in command and "--flip" not in command
+    assert command[command.index("--lpips-weights") + 1] == "weights.npz"
+    assert command[command.index("--steps") + 1] == "5"
 
 
 def test_a_finished_run_is_not_repeated_and_one_of_other_settings_is(
