@@ -23,7 +23,7 @@ def asked(command: list[str], *options: str) -> tuple[int, str]:
 
 
 def test_the_package_conforms() -> None:
-    status, output = asked(PACKAGE)
+    status, output = asked(PACKAGE, "--seconds", "600")  # the first job compiles the kernels
     assert status == 0, output
     assert output.endswith("conforms\n") and "not offered" not in output
     for kind in run.KINDS:
@@ -73,7 +73,7 @@ def test_the_judge_finds_a_decoder_that(name: str, tmp_path: Path) -> None:
 
 def test_one_wrong_bit_of_an_array_is_found(tmp_path: Path) -> None:
     job = next(job for job in run.jobs() if job.kind == "unusual")
-    with run.Decoder(PACKAGE, 120.0) as decoder:
+    with run.Decoder(PACKAGE, 600.0) as decoder:
         assert decoder.problem_of(job) == ""
         decoder._ask("\t".join(("decode", job.fields[1], str(tmp_path))))
     assert job.check("ok", tmp_path) == ""
