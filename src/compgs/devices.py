@@ -38,7 +38,7 @@ def choose(device: "Device | None") -> Choice:
         name = str(device)
         check_device(name)
         return Choice(name, "")
-    if missing("train") or not _gpus():
+    if "torch" in missing("cuda") or not _gpus():
         return Choice(CPU, "PyTorch finds no CUDA GPU")
     if missing("cuda"):
         return Choice(CPU, f"there is a GPU, but gsplat is not installed ({install_line('cuda')})")
@@ -71,7 +71,8 @@ def check_device(name: str) -> None:
         raise ConfigError(f"device {name}: expected cpu or cuda")
     if kind == CPU:
         return
-    require("train", f"device {name}:")
+    if "torch" in missing("cuda"):
+        require("cuda", f"device {name}:")
     if int(number or 0) >= _gpus():
         raise ConfigError(
             f"device {name}: PyTorch finds {_gpus()} CUDA devices; use cpu, or install a CUDA build of PyTorch"

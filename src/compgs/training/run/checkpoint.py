@@ -24,6 +24,7 @@ from compgs.outputs import replacing
 from compgs.scene.capture import check_camera
 from compgs.scene.points import COORDINATE_BITS
 from compgs.scene.views import Scene
+from compgs.stored_weights import MOST_BITS
 from compgs.trained_model import TrainedModel
 from compgs.training.plan import Plan
 from compgs.training.run.restoring import (
@@ -189,7 +190,7 @@ def _model(config: Config, plan: Plan, scene: dict[str, Any], tensors: dict[str,
     )
     if scene["angular_dilation"] is not None:
         (model.angular_dilation,) = finite([scene["angular_dilation"]], 1, "angular_dilation", above=0.0)
-    model.head_bits = whole_number(scene["head_bits"], 1, config.entropy.head_bits, "head_bits")
+    model.head_bits = whole_number(scene["head_bits"], 1, MOST_BITS, "head_bits")
     model.viewpoints = tuple(_camera(entry) for entry in scene["viewpoints"])
     up_x, up_y, up_z = finite(scene["up"], 3, "up")
     model.up = (up_x, up_y, up_z)
