@@ -93,7 +93,9 @@ def write(request: pytest.FixtureRequest) -> Callable[[Path], None]:
         return lambda path: write_bytes(path, b"new")
     from compgs.training.run.checkpoint import write_checkpoint_file
 
-    return lambda path: write_checkpoint_file(path, "compgs", {"a": torch.zeros(3)}, {})
+    return lambda path: write_checkpoint_file(
+        path, "compgs", {"a": torch.zeros(3)}, {}, device=torch.device("cpu")
+    )
 
 
 def test_temporary_names_cannot_be_foreseen_and_no_link_is_followed(

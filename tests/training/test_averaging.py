@@ -86,7 +86,7 @@ def test_a_run_that_was_stopped_among_its_last_steps_ends_with_the_same_mean(
 @pytest.mark.parametrize("steps", [-1, "3", None, True])
 def test_a_number_of_steps_that_is_none_is_refused(steps: object) -> None:
     with pytest.raises(ValueError, match="averaged steps"):
-        Averaging(torch.nn.Linear(2, 2)).restore(steps, {})
+        Averaging(torch.nn.Linear(2, 2)).restore({}, {"averaged": steps})
 
 
 def test_a_mean_of_other_parameters_is_refused() -> None:

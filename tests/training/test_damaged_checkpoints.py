@@ -155,6 +155,19 @@ def test_what_a_checkpoint_says_of_the_plan_is_checked(
         resumed("compgs", blob_scene, path, config)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_goes_on_on_the_kind_of_device_that_it_began_on(
+    kind: str, written, blob_scene, tmp_path: Path
+) -> None:
+    source, config = written[kind]
+    tensors, metadata = contents(source)
+    assert metadata["device"] == "cpu"
+    path = tmp_path / "moved"
+    safetensors.torch.save_file(tensors, path, metadata={**metadata, "device": "cuda"})
+    with pytest.raises(CheckpointError, match="began on cuda.*--device cuda"):
+        resumed(kind, blob_scene, path, config)
+
+
 def test_settings_out_of_range_are_the_checkpoints_fault(written, tmp_path: Path) -> None:
     source, _ = written["compgs"]
     for section, key, value in (("model", "width", 10**9), ("training", "steps", "x"), ("model", "odd", 1)):

@@ -184,7 +184,7 @@ def test_channels_go_at_the_last_turn_alone_and_rates_follow_at_each(
         trainer.step = step
         trainer.turn_references()
         assert trainer.model.reference_dim == channels
-        assert torch.equal(trainer.reference_rates, channel_rates(trainer.model.references))
+        assert torch.equal(trainer.channel_rates.values, channel_rates(trainer.model.references))
 
 
 def test_a_step_with_momentum_does_not_care_when_the_axes_turn(
@@ -214,7 +214,7 @@ def test_each_channel_moves_as_far_as_its_rate_says(blob_scene: Scene, tiny_conf
     assert torch.equal(plain.model.references, other.model.references)
     before = plain.model.references.detach().clone()
     rates = torch.linspace(0.0, 3.5, before.shape[1])
-    other.reference_rates = rates
+    other.channel_rates.values = rates
     plain.train_step()
     other.train_step()
     moved = plain.model.references.detach() - before

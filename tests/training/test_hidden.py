@@ -68,6 +68,25 @@ def test_memory_follows_anchors_that_come_and_go():
     assert hidden.others(1, torch.arange(5)).tolist() == [0, 1, 3, 4]
 
 
+def test_a_bit_is_kept_for_each_anchor_and_view_and_views_do_not_mix():
+    hidden = memory(views=300, anchors=50)
+    assert hidden.hidden.numel() == 50 * 38 and hidden.hidden.element_size() == 1
+    chance = torch.Generator().manual_seed(0)
+    expected = torch.zeros(50, 300, dtype=torch.bool)
+    for view in (0, 7, 8, 9, 255, 299, 7, 8):
+        rows = torch.nonzero(torch.rand(50, generator=chance) < 0.7).view(-1)
+        found = torch.rand(len(rows), generator=chance) < 0.5
+        sizes = torch.where(found, 0.0, 1.0).repeat_interleave(K)
+        index = torch.arange(K * len(rows))
+        prediction = SimpleNamespace(index=index, opacities=torch.zeros(len(index)))
+        gaussians = SimpleNamespace(opacities=torch.full((len(index),), 0.5))
+        hidden.observe(view, rows, prediction, gaussians, GradientSizes(sizes))
+        expected[rows, view] = found
+    for view in range(300):
+        shown = hidden.others(view, torch.arange(50))
+        assert shown.tolist() == torch.nonzero(~expected[:, view]).view(-1).tolist()
+
+
 def test_without_a_share_nothing_is_remembered():
     hidden = memory(share=0.0)
     assert observed(hidden, [0], [0], [0.5], [0.0]) == [0, 1, 2, 3]
@@ -88,14 +107,14 @@ def test_where_hardly_anything_is_drawn_nothing_is_hidden():
 def test_what_one_rank_remembers_comes_back_and_is_of_no_use_to_several():
     one, other = memory(), memory()
     observed(one, [0, 3], [0, 1, 6, 7], [0.5] * 4, [0.0, 0.0, 1.0, 1.0])
-    other.restore(one.tensors())
+    other.restore(one.tensors(), {})
     assert torch.equal(other.hidden, one.hidden) and one.hidden.any()
     of_several = memory(share=0.0)
-    of_several.restore(one.tensors())
+    of_several.restore(one.tensors(), {})
     assert of_several.others(1, torch.arange(4)).tolist() == [0, 1, 2, 3]
-    other.restore(of_several.tensors())
+    other.restore(of_several.tensors(), {})
     with pytest.raises(ValueError, match="hidden: expected"):
-        other.restore(memory(anchors=5).tensors())
+        other.restore(memory(anchors=5).tensors(), {})
 
 
 @pytest.fixture

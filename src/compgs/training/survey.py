@@ -8,13 +8,15 @@ looked at than there were to see; with a margin of 1.25 it is 2 %, and one ancho
 of the anchor's sizes in place of a measurement let 5 % more through, and missed one in 7 500.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from compgs.tensors.prediction import drawn_reach
 from compgs.trained_model import TrainedModel
+from compgs.training.run.restoring import check_tensor
 
 MARGIN = 1.5  # for what changes between two measurements
 EVERY = 32  # steps between two; geometry alone, without gradients, is about a twentieth of a step
@@ -48,6 +50,20 @@ class AnchorBounds:
         if self.measured is None or len(self.measured) != self.model.anchors:
             self.measured = self._measure() / self._sizes()
         return MARGIN * self.measured * self._sizes()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The last measurement, for a checkpoint, if there is one."""
+        return {} if self.measured is None else {"bounds": self.measured}
+
+    def state(self) -> dict[str, Any]:
+        """Nothing beside the tensors."""
+        return {}
+
+    def restore(self, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
+        """Inverse of `tensors`. Raises ValueError."""
+        if "bounds" in tensors:
+            check_tensor(tensors["bounds"], (self.model.anchors,), torch.float32, "bounds")
+            self.measured = tensors["bounds"].to(self.model.device)
 
     def _measure(self) -> Tensor:
         """[N] world units: as they are now."""

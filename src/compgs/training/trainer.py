@@ -52,13 +52,10 @@ from compgs.training.run.checkpoint import (
     Writer,
     check_same_run,
     load_checkpoint,
-    optimizer_tensors,
-    restore_optimizer,
     save_checkpoint,
 )
 from compgs.training.run.distributed import (
     check_identical,
-    leave_to_first,
     mine,
     sum_gradients,
     sum_over_ranks,
@@ -74,8 +71,9 @@ from compgs.training.run.loop import (
     rasterize_step,
     run_to_end,
 )
+from compgs.training.run.parts import Chance, Memory, Statistics
 from compgs.training.run.profile import StepProfile
-from compgs.training.run.restoring import check_tensor, restore_chance, restore_statistics, restoring
+from compgs.training.run.restoring import restoring
 from compgs.training.run.seen_points import check_points_seen
 from compgs.training.shortcuts.coarse import CoarseViews
 from compgs.training.shortcuts.hidden import HiddenAnchors
@@ -85,7 +83,7 @@ from compgs.training.step.step_views import Noise, StepViews, step_views
 from compgs.training.step.views_in_turn import ViewsInTurn
 from compgs.training.structure.averaging import Averaging
 from compgs.training.structure.control import AdaptiveControl, make_schedule
-from compgs.training.structure.decorrelation import channel_rates, decorrelate, drop_silent_channels
+from compgs.training.structure.decorrelation import ChannelRates, decorrelate, drop_silent_channels
 from compgs.training.structure.events import Event, at_shares
 from compgs.training.structure.importance import missed, spread, view_contributions
 from compgs.training.structure.pruning import judged, paying, squared_changes
@@ -161,13 +159,13 @@ class Trainer:
         self.control = AdaptiveControl(config, self.schedule, self.shape, device, (self.hidden.replaced,))
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
         self.noise = UniformNoise(t.seed + 3, self.views.chance, device)
-        self.reference_rates: Tensor | None = None  # [reference_dim], once the channels differ in it
         self.settings = RasterSettings(
             background=scene.background, angular_dilation=self.model.angular_dilation
         )
         self.step = 0
         self.rate = RateState(t.lmbda)
         self.decorrelated_at = at_shares(config.entropy.decorrelate_at, t.steps)
+        self.channel_rates = ChannelRates(self.model, self.decorrelated_at)
         pruned_at = at_shares(config.control.prune_at, t.steps)
         self.target_size = TargetSize(
             self.model, self.schedule, pruned_at, self.contributions, self.changes, self.plan.bit_discount
@@ -382,11 +380,8 @@ class Trainer:
         exposures = self.views.exposure_gradients(looks.views)
         sum_gradients(parameters_of(self.optimizer), loss, *exposures)
         set_learning_rates(self.optimizer, self.progress, DECAYS[t.schedule], t.head_warm_up)
-        references, rates = self.model.references.detach(), self.reference_rates
-        before = references.clone() if rates is not None else references
-        self.optimizer.step()
-        if rates is not None:
-            references.copy_(before.lerp_(references, rates))
+        with self.channel_rates.applied():
+            self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.views.learn(self.progress, looks.views, exposures)
 
@@ -471,7 +466,7 @@ class Trainer:
         decorrelate(self.model, self.optimizer)
         if self.step == max(self.decorrelated_at):
             drop_silent_channels(self.model, self.optimizer)
-        self.reference_rates = channel_rates(self.model.references)
+        self.channel_rates.follow()
 
     def contributions(self, most: int = LOOKED_AT) -> Tensor:
         """[N, K] float64: what the coupled primitives add to the training views, or to at most `most` of them."""
@@ -561,48 +556,32 @@ class Trainer:
                 self.write(path, writer)
 
     def write(self, path: Path, writer: Writer | None) -> None:
-        extra = {f"control/{name}": getattr(self.control, name) for name in AdaptiveControl.STATISTICS}
-        extra["chance"] = self.chance.get_state()
-        extra |= self.views.tensors() | self.average.tensors() | self.hidden.tensors()
-        if self.reference_rates is not None:
-            extra["reference_rates"] = self.reference_rates
-        if self.bounds.measured is not None:
-            extra["bounds"] = self.bounds.measured
-        state = {
-            "step": self.step,
-            **self.views.state(),
-            "rate": asdict(self.rate),
-            "averaged": self.average.steps,
-        }
-        moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
-        save_checkpoint(path, Checkpoint(self.model, self.plan, moments, extra, state), writer)
+        memory = self.memory
+        state = {"step": self.step, "rate": asdict(self.rate), **memory.state()}
+        saved = Checkpoint(self.model, self.plan, memory.moments(), memory.tensors(), state)
+        save_checkpoint(path, saved, writer)
 
     @classmethod
     def resumed(cls, scene: Scene, path: Path, config: Config, device: torch.device) -> "Trainer":
-        """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
-        checkpoint = load_checkpoint(path)
+        """Raises CheckpointError if there is no checkpoint, or the run was another scene's, or had other settings or
+        another device.
+        """
+        checkpoint = load_checkpoint(path, device)
         with restoring(path):
             check_same_run(checkpoint.model.config, config, checkpoint.state["views"], scene)
         trainer = cls(scene, config, device, checkpoint.model)
         with restoring(path):
-            restore_optimizer(dict(trainer.model.named_parameters()), trainer.optimizer, checkpoint.optimizer)
-            restore_statistics(trainer.control, AdaptiveControl.STATISTICS, checkpoint.extra)
-            leave_to_first(trainer.control, AdaptiveControl.STATISTICS)
-            if any(at < checkpoint.state["step"] for at in trainer.decorrelated_at):
-                rates = checkpoint.extra["reference_rates"]
-                check_tensor(rates, (trainer.model.reference_dim,), torch.float32, "reference_rates")
-                trainer.reference_rates = rates.to(device)
-            if "bounds" in checkpoint.extra:
-                bounds = checkpoint.extra["bounds"]
-                check_tensor(bounds, (trainer.model.anchors,), torch.float32, "bounds")
-                trainer.bounds.measured = bounds.to(device)
-            trainer.hidden.restore(checkpoint.extra)
-            restore_chance(trainer.chance, checkpoint.extra)
-            trainer.views.restore(checkpoint.state, checkpoint.extra)
-            trainer.average.restore(checkpoint.state["averaged"], checkpoint.extra)
+            trainer.memory.restore(checkpoint.optimizer, checkpoint.extra, checkpoint.state)
             trainer.step = checkpoint.state["step"]
             trainer.rate = RateState.restored(checkpoint.state["rate"])
         return trainer
+
+    @property
+    def memory(self) -> Memory:
+        """What the run remembers between two steps, but for the model, the step and lambda."""
+        statistics = Statistics(self.control, AdaptiveControl.STATISTICS)
+        parts = (statistics, self.channel_rates, self.bounds, self.hidden, Chance(self.chance), self.views)
+        return Memory(lambda: dict(self.model.named_parameters()), self.optimizer, (*parts, self.average))
 
 
 def plan_of(model: TrainedModel, scene: Scene, device: torch.device) -> Plan:

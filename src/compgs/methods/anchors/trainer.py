@@ -25,22 +25,18 @@ from compgs.training.optimizers import ADAM_EPSILON, DECAYS, set_learning_rates
 from compgs.training.run.checkpoint import (
     Writer,
     check_same_run,
-    optimizer_tensors,
     read_checkpoint_file,
-    restore_optimizer,
     tensors_by_kind,
     write_checkpoint_file,
 )
 from compgs.training.run.distributed import world
 from compgs.training.run.loop import Run, StepResult, rasterize_step, run_to_end
+from compgs.training.run.parts import Chance, Memory, Statistics
 from compgs.training.run.restoring import (
-    check_moments,
     check_step,
     check_tensor,
     check_tensors,
     finite,
-    restore_chance,
-    restore_statistics,
     restoring,
 )
 from compgs.training.run.seen_points import check_points_seen
@@ -226,20 +222,25 @@ class AnchorTrainer:
 
     def save(self, path: Path | None, writer: Writer | None = None) -> None:
         assert path is not None, "it trains in one process"
+        memory = self.memory
         tensors = {f"model/{name}": value for name, value in self.model.state_dict().items()}
-        moments = optimizer_tensors(dict(self.model.named_parameters()), self.optimizer)
-        tensors |= {f"optimizer/{name}": value for name, value in moments.items()}
-        tensors |= {f"extra/control/{n}": getattr(self.control, n) for n in AdaptiveControl.STATISTICS}
-        tensors |= {f"extra/{name}": value for name, value in self.views.tensors().items()}
-        tensors["extra/chance"] = self.chance.get_state()
-        state = {"step": self.step, **self.views.state(), **self.more_state()}
+        tensors |= {f"optimizer/{name}": value for name, value in memory.moments().items()}
+        tensors |= {f"extra/{name}": value for name, value in memory.tensors().items()}
+        state = {"step": self.step, **memory.state(), **self.more_state()}
         frame = {name: value for name, value in vars(self.model.frame).items()}
         metadata = {
             "config": json.dumps(self.config.to_dict()),
             "frame": json.dumps(frame),
             "state": json.dumps(state),
         }
-        write_checkpoint_file(path, self.method, tensors, metadata, writer)
+        write_checkpoint_file(path, self.method, tensors, metadata, writer, device=self.device)
+
+    @property
+    def memory(self) -> Memory:
+        """What the run remembers between two steps, but for the model and the step."""
+        statistics = Statistics(self.control, AdaptiveControl.STATISTICS)
+        parts = (statistics, Chance(self.chance), self.views)
+        return Memory(lambda: dict(self.model.named_parameters()), self.optimizer, parts)
 
     def more_state(self) -> dict[str, Any]:
         """What else a checkpoint says, as JSON takes it."""
@@ -253,7 +254,7 @@ class AnchorTrainer:
         cls, scene: Scene, path: Path, config: Config, device: torch.device, method: str
     ) -> "AnchorTrainer":
         """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
-        tensors, metadata = read_checkpoint_file(path, method)
+        tensors, metadata = read_checkpoint_file(path, method, device)
         with restoring(path):
             state = json.loads(metadata["state"])
             saved = config_from_dict(json.loads(metadata["config"]), str(path), type(config))
@@ -263,11 +264,7 @@ class AnchorTrainer:
             model = cls._model(config, json.loads(metadata["frame"]), parts["model"])
         trainer = cls(scene, config, device, method, model)
         with restoring(path):
-            check_moments(parts["optimizer"], dict(model.named_parameters()))
-            restore_optimizer(dict(model.named_parameters()), trainer.optimizer, parts["optimizer"])
-            restore_statistics(trainer.control, AdaptiveControl.STATISTICS, parts["extra"])
-            restore_chance(trainer.chance, parts["extra"])
-            trainer.views.restore(state, parts["extra"])
+            trainer.memory.restore(parts["optimizer"], parts["extra"], state)
             trainer.restore_state(state)
             trainer.step = state["step"]
         return trainer

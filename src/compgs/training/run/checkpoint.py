@@ -117,7 +117,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, writer: Writer | None = 
         "plan": json.dumps(checkpoint.plan.to_dict()),
         "state": json.dumps(checkpoint.state),
     }
-    write_checkpoint_file(path, "compgs", tensors, metadata, writer)
+    write_checkpoint_file(path, "compgs", tensors, metadata, writer, device=model.device)
 
 
 def write_checkpoint_file(
@@ -126,9 +126,14 @@ def write_checkpoint_file(
     tensors: dict[str, Tensor],
     metadata: dict[str, str],
     writer: Writer | None = None,
+    *,
+    device: torch.device,
 ) -> None:
-    """Tensors by name and JSON texts by name, of a method's run. Raises OutputError; see `save_checkpoint`."""
+    """Tensors by name and JSON texts by name, of a method's run on a device. Raises OutputError; see
+    `save_checkpoint`.
+    """
     stamp = {"format": "compgs checkpoint", "version": CHECKPOINT_VERSION, "method": method}
+    stamp["device"] = device.type
     copy = writer is not None
     content = {k: v.detach().to("cpu", copy=copy).contiguous() for k, v in tensors.items()}
     write = partial(_write, path, content, metadata | stamp)
@@ -146,9 +151,12 @@ def _write(path: Path, content: dict[str, Tensor], metadata: dict[str, str]) -> 
         raise OutputError(f"{path}: the checkpoint cannot be written ({error})") from error
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
-    """Raises CheckpointError if there is none, or it is damaged, of another version or of another method."""
-    tensors, metadata = read_checkpoint_file(path, "compgs")
+def load_checkpoint(path: Path, device: torch.device | None = None) -> Checkpoint:
+    """Read a checkpoint, to go on with it on a `device` if one is given.
+
+    Raises CheckpointError if there is none, or it is damaged, of another version, method or kind of device.
+    """
+    tensors, metadata = read_checkpoint_file(path, "compgs", device)
     with restoring(path):
         config = config_from_dict(json.loads(metadata["config"]), str(path))
         parts = tensors_by_kind(tensors)
@@ -211,7 +219,9 @@ def _camera(entry: dict[str, Any]) -> Camera:
     return camera
 
 
-def read_checkpoint_file(path: Path, method: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+def read_checkpoint_file(
+    path: Path, method: str, device: torch.device | None = None
+) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Inverse of `write_checkpoint_file`. Raises CheckpointError, as `load_checkpoint`."""
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint; start the run without resuming")
@@ -228,6 +238,12 @@ def read_checkpoint_file(path: Path, method: str) -> tuple[dict[str, Tensor], di
     found = metadata.get("method", "compgs")
     if found != method:
         raise CheckpointError(f"{path}: a run of method {found}, expected one of method {method}")
+    began = metadata.get("device", "")
+    if device is not None and device.type != began:
+        raise CheckpointError(
+            f"{path}: the run began on {began}, whose random numbers {device.type} does not have; continue it with "
+            f"--device {began} (in Python device={began!r}), or train anew"
+        )
     return tensors, metadata
 
 

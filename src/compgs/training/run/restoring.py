@@ -78,21 +78,6 @@ def check_moments(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor
             raise ValueError(f"moments are missing, such as {parameter}/{min(missing)}")
 
 
-def restore_statistics(control: Any, names: Sequence[str], extra: Mapping[str, Tensor]) -> None:
-    """The attributes of a density control, as large as those that it has. Raises ValueError, KeyError."""
-    for name in names:
-        value, now = extra[f"control/{name}"], getattr(control, name)
-        check_tensor(value, now.shape, now.dtype, f"control/{name}")
-        setattr(control, name, value.to(now.device))
-
-
-def restore_chance(generator: torch.Generator, extra: Mapping[str, Tensor]) -> None:
-    """Its state. Raises ValueError, KeyError, RuntimeError for what is none."""
-    state = generator.get_state()
-    check_tensor(extra["chance"], state.shape, state.dtype, "chance")
-    generator.set_state(extra["chance"])
-
-
 def check_step(state: Mapping[str, Any], steps: int) -> None:
     """Of the run's state. Raises ValueError for a step outside of the run."""
     whole_number(state["step"], 0, steps, "step")

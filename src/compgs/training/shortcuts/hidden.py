@@ -11,6 +11,7 @@ small the error is.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,11 +32,14 @@ class HiddenAnchors:
         self.share = share
         anchors, self.coupled_primitives = shape
         remembered = views if self.share > 0.0 else 0
-        self.hidden = torch.zeros(anchors, remembered, dtype=torch.bool, device=device)
+        # [N, views / 8] a bit for each anchor and view: of a million anchors and 300 views 38 MB
+        self.hidden = torch.zeros(anchors, -(-remembered // 8), dtype=torch.uint8, device=device)
 
     def others(self, view: int, rows: Tensor) -> Tensor:
         """Of the anchors `rows` [V] int64 those that are not hidden in a view."""
-        return rows if self.share <= 0.0 else rows[~self.hidden[rows, view]]
+        if self.share <= 0.0:
+            return rows
+        return rows[(self.hidden[rows, view // 8] & (1 << view % 8)) == 0]
 
     def observe(
         self, view: int, rows: Tensor, prediction: Prediction, gaussians: Gaussians, sizes: GradientSizes
@@ -56,27 +60,32 @@ class HiddenAnchors:
                 self.share,
                 found.numpy(),
             )
-        self.hidden[rows, view] = found
+        bits = self.hidden[rows, view // 8] & (0xFF ^ (1 << view % 8))
+        self.hidden[rows, view // 8] = bits | (found.to(torch.uint8) << view % 8)
 
     def replaced(self, kept: Tensor, new: int) -> None:
         """Only the anchors `kept` [N] bool are left, and so many new ones follow."""
-        views = self.hidden.shape[1]
-        self.hidden = torch.cat([self.hidden[kept], self.hidden.new_zeros(new, views)])
+        none = self.hidden.new_zeros(new, self.hidden.shape[1])
+        self.hidden = torch.cat([self.hidden[kept], none])
 
     def tensors(self) -> dict[str, Tensor]:
         """For a checkpoint."""
         return {"hidden": self.hidden}
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+    def state(self) -> dict[str, Any]:
+        """Nothing beside the tensors."""
+        return {}
+
+    def restore(self, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
         """From a checkpoint; what one rank remembered is of no use to several, which remember nothing, nor the other
         way round. Raises ValueError, KeyError, IndexError for a damaged one.
         """
         hidden = tensors["hidden"]
-        anchors, views = self.hidden.shape
-        if 0 in (views, hidden.shape[-1]):
-            check_tensor(hidden[:, :0], (anchors, 0), torch.bool, "hidden")
+        anchors, columns = self.hidden.shape
+        if 0 in (columns, hidden.shape[-1]):
+            check_tensor(hidden[:, :0], (anchors, 0), torch.uint8, "hidden")
             return
-        check_tensor(hidden, (anchors, views), torch.bool, "hidden")
+        check_tensor(hidden, (anchors, columns), torch.uint8, "hidden")
         self.hidden = hidden.to(self.hidden.device)
 
 

@@ -30,13 +30,11 @@ from compgs.training.optimizers import exponential_decay, parameters_of, rates_f
 from compgs.training.run.checkpoint import (
     Writer,
     check_same_run,
-    optimizer_tensors,
     read_checkpoint_file,
-    restore_optimizer,
     tensors_by_kind,
     write_checkpoint_file,
 )
-from compgs.training.run.distributed import check_identical, leave_to_first, mine, sum_gradients, whole
+from compgs.training.run.distributed import check_identical, mine, sum_gradients, whole
 from compgs.training.run.loop import (
     Run,
     StepResult,
@@ -46,14 +44,12 @@ from compgs.training.run.loop import (
     rasterize_step,
     run_to_end,
 )
+from compgs.training.run.parts import Chance, Memory, Statistics
 from compgs.training.run.profile import StepProfile
 from compgs.training.run.restoring import (
-    check_moments,
     check_step,
     check_tensor,
     finite,
-    restore_chance,
-    restore_statistics,
     restoring,
 )
 from compgs.training.run.seen_points import check_points_seen
@@ -316,21 +312,24 @@ class SplatTrainer:
                 self.write(path, writer)
 
     def write(self, path: Path, writer: Writer | None) -> None:
+        memory = self.memory
         tensors = {f"model/{name}": p for name, p in vars(self.parameters.trained()).items()}
-        moments = optimizer_tensors(self.named_parameters(), self.optimizer)
-        tensors |= {f"optimizer/{name}": value for name, value in moments.items()}
-        tensors |= {f"extra/control/{n}": getattr(self.control, n) for n in DensityControl.STATISTICS}
+        tensors |= {f"optimizer/{name}": value for name, value in memory.moments().items()}
+        tensors |= {f"extra/{name}": value for name, value in memory.tensors().items()}
         tensors |= {f"extra/{HOOKS}{name}": value for name, value in hook_state(self.hooks).items()}
-        tensors |= {f"extra/{name}": value for name, value in self.views.tensors().items()}
-        tensors["extra/chance"] = self.chance.get_state()
-        state = {
-            "step": self.step,
-            "phase": self.phase,
-            **self.views.state(),
-            "world_offset": self.world_offset,
+        place = {"step": self.step, "phase": self.phase, "world_offset": self.world_offset}
+        metadata = {
+            "config": json.dumps(self.config.to_dict()),
+            "state": json.dumps({**place, **memory.state()}),
         }
-        metadata = {"config": json.dumps(self.config.to_dict()), "state": json.dumps(state)}
-        write_checkpoint_file(path, self.method, tensors, metadata, writer)
+        write_checkpoint_file(path, self.method, tensors, metadata, writer, device=self.device)
+
+    @property
+    def memory(self) -> Memory:
+        """What the run remembers between two steps, but for the splats, the hooks and the step."""
+        statistics = Statistics(self.control, DensityControl.STATISTICS)
+        parts = (statistics, Chance(self.chance), self.views)
+        return Memory(self.named_parameters, self.optimizer, parts)
 
     def named_parameters(self) -> dict[str, nn.Parameter]:
         """All that is trained."""
@@ -350,7 +349,7 @@ class SplatTrainer:
         method: str = METHOD,
     ) -> "SplatTrainer":
         """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
-        tensors, metadata = read_checkpoint_file(path, method)
+        tensors, metadata = read_checkpoint_file(path, method, device)
         with restoring(path):
             state = json.loads(metadata["state"])
             saved = config_from_dict(json.loads(metadata["config"]), str(path), type(config))
@@ -365,12 +364,7 @@ class SplatTrainer:
             own = {name.removeprefix(HOOKS): v for name, v in extra.items() if name.startswith(HOOKS)}
             restore_hooks(trainer.hooks, own)
             trainer.train_hooks()
-            check_moments(parts["optimizer"], trainer.named_parameters())
-            restore_optimizer(trainer.named_parameters(), trainer.optimizer, parts["optimizer"])
-            restore_statistics(trainer.control, DensityControl.STATISTICS, extra)
-            leave_to_first(trainer.control, DensityControl.STATISTICS)
-            restore_chance(trainer.chance, extra)
-            trainer.views.restore(state, extra)
+            trainer.memory.restore(parts["optimizer"], extra, state)
             trainer.step = state["step"]
         return trainer
 

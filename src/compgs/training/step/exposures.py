@@ -8,7 +8,7 @@ the colors between all views. A decay pulls them back to M = 1, b = 0, else all 
 the scene darkens.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -75,7 +75,7 @@ class Exposures:
             "exposure/steps": self.steps,
         }
 
-    def restore(self, tensors: dict[str, Tensor]) -> None:
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Inverse of `tensors`. Raises ValueError, KeyError for what is none."""
         for name in ("change", "moments", "steps"):
             value, stored = getattr(self, name), tensors[f"exposure/{name}"]

@@ -6,7 +6,7 @@ the others. Lanes do not depend on how many ranks there are. Where they are not 
 ones come a little more often.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -111,8 +111,8 @@ class ViewsInTurn:
         """For a checkpoint."""
         return {} if self.exposures is None else self.exposures.tensors()
 
-    def restore(self, state: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-        """Go on from a `state` and `tensors`. Raises ValueError and the like for what is none."""
+    def restore(self, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
+        """Go on from `tensors` and a `state`. Raises ValueError and the like for what is none."""
         if self.exposures is not None:
             self.exposures.restore(tensors)
         self.chance.bit_generator.state = state["shuffle"]

@@ -6,6 +6,7 @@ without it (Polyak and Juditsky 1992).
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -47,12 +48,16 @@ class Averaging:
         self.forget()
 
     def tensors(self) -> dict[str, Tensor]:
-        """For a checkpoint, beside the number of `steps`."""
+        """The mean, for a checkpoint."""
         return {f"average/{name}": mean for name, mean in self.mean.items()}
 
-    def restore(self, steps: object, tensors: Mapping[str, Tensor]) -> None:
-        """Inverse of `tensors`. Raises ValueError, KeyError."""
-        self.steps = whole_number(steps, 0, 1 << 62, "averaged steps")
+    def state(self) -> dict[str, Any]:
+        """The number of steps, for a checkpoint."""
+        return {"averaged": self.steps}
+
+    def restore(self, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
+        """Inverse of `tensors` and `state`. Raises ValueError, KeyError."""
+        self.steps = whole_number(state["averaged"], 0, 1 << 62, "averaged steps")
         if self.steps == 0:
             return
         for name, parameter in self.model.named_parameters():

@@ -15,8 +15,10 @@ Adam moves all channels alike. But the first axes hold most of the information a
 last ones hardly leave zero and would only wander. So the learning rates follow the spread of the channels.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +28,7 @@ from compgs.tensors import where
 from compgs.tensors.linear import transposed_product
 from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import replace_parameter
+from compgs.training.run.restoring import check_tensor
 
 # Learning rate of a channel that spreads over one step; it goes with the root of the spread, down to the second number.
 # Rates a seventh higher and lower came out alike (docs/results/decisions.md).
@@ -55,6 +58,46 @@ def channel_rates(references: Tensor) -> Tensor:
     return torch.from_numpy(np.maximum(RATE_OF_ONE * np.sqrt(_spread(references)), SMALLEST_RATE)).to(
         references
     )
+
+
+class ChannelRates:
+    """The channels' learning rates, as multiples of their group's, once references have been turned."""
+
+    def __init__(self, model: TrainedModel, turned_at: frozenset[int]) -> None:
+        """`turned_at`: steps of the run at which references are turned."""
+        self.model = model
+        self.turned_at = turned_at
+        self.values: Tensor | None = None  # [reference_dim]; None: all channels have the same
+
+    def follow(self) -> None:
+        """Take the rates that the references ask for now."""
+        self.values = channel_rates(self.model.references)
+
+    @contextmanager
+    def applied(self) -> Iterator[None]:
+        """A step of the optimizer inside moves each channel by its own rate."""
+        references, rates = self.model.references.detach(), self.values
+        if rates is None:
+            yield
+            return
+        before = references.clone()
+        yield
+        references.copy_(before.lerp_(references, rates))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The rates, for a checkpoint, if there are some."""
+        return {} if self.values is None else {"reference_rates": self.values}
+
+    def state(self) -> dict[str, Any]:
+        """Nothing beside the tensors."""
+        return {}
+
+    def restore(self, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
+        """Inverse of `tensors`. Raises ValueError, KeyError."""
+        if any(at < state["step"] for at in self.turned_at):
+            values = tensors["reference_rates"]
+            check_tensor(values, (self.model.reference_dim,), torch.float32, "reference_rates")
+            self.values = values.to(self.model.device)
 
 
 @torch.no_grad()
