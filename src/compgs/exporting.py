@@ -226,7 +226,8 @@ class Limits:
         return baked
 
     def affordable_degree(self, baked: Baked, size: Callable[[Baked], int]) -> int:
-        """Of the harmonics: the one asked for, else the highest with which all splats fit, LEAST_DEGREE at least.
+        """Choose the degree of the harmonics: the one asked for, else the highest with which all splats fit,
+        LEAST_DEGREE at least.
 
         All splats of degree 1 are 15 dB nearer to a scene than half of them of degree 3, in a file of one size.
         """
@@ -263,14 +264,16 @@ def _limited(
 
 
 def _cut(baked: Baked, degree: int) -> Baked:
-    """Without the harmonics above a degree; itself, where there are none."""
+    """Return the splats without harmonics above a degree; the same where there are none."""
     if degree >= baked.splats.degree:
         return baked
     return replace(baked, splats=baked.splats.of_degree(degree))
 
 
 def own_cameras(model: Renderable) -> list[Camera]:
-    """Of the world: those that the scene was captured with, where its file names more than one; else all around."""
+    """Return cameras of the world: those that the scene was captured with, where its file names more than one; else all
+    around.
+    """
     if isinstance(model, HybridModel) and len(model.viewpoints) > 1:
         return list(model.viewpoints)
     around = surround(model.bounds[0])
@@ -323,7 +326,7 @@ def _splats_of(
 
 
 def _arrays(baked: Baked, model: Renderable, kind: str) -> SplatArrays:
-    """With the place of the model's frame where the format has room for it."""
+    """Return the arrays, with the place of the model's frame where the format has room for it."""
     origin = model.world_offset if kind in KEEP_WORLD_OFFSET else (0.0, 0.0, 0.0)
     return replace(baked.splats, world_offset=origin)
 
@@ -350,7 +353,7 @@ def _compared(
 
 
 def _counter(total: int, progress: Callable[[int, int], None] | None) -> Callable[[], None]:
-    """To be called once for everything that is counted."""
+    """Return a function to be called once for everything that is counted."""
     done = itertools.count(1)
 
     def count() -> None:

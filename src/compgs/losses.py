@@ -51,8 +51,8 @@ class Target:
     def from_image(
         image: np.ndarray, device: torch.device | str = "cpu", mask: np.ndarray | None = None
     ) -> "Target":
-        """From uint8 [H, W, 3] and bool [H, W], True where a pixel counts; on the CPU it shares the arrays' memory
-        where it can.
+        """Make a target from uint8 [H, W, 3] and bool [H, W], True where a pixel counts; on the CPU it shares the
+        arrays' memory where it can.
         """
         counted = None if mask is None else _tensor(mask, device)
         return Target(_tensor(image, device), counted)

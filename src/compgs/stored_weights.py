@@ -20,7 +20,7 @@ class StoredWeights:
     head: int  # of prediction heads
 
     def bits(self, name: str, tensor: Tensor) -> int:
-        """Of a tensor of the heads, by its name in the file."""
+        """Return the bits of a weight of the heads' tensor of that name in the file."""
         if name == SHARED_RESIDUALS:
             return SHARED_RESIDUAL_BITS
         return self.head if tensor.dim() > 1 else min(MOST_BITS, self.head + MORE_FOR_BIASES)

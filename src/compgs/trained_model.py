@@ -175,7 +175,7 @@ class TrainedModel(nn.Module):
 
     @property
     def dimensions(self) -> ModelDimensions:
-        """As they are now."""
+        """Return the sizes as they are now."""
         m = self.config.model
         return ModelDimensions(
             self.mask.shape[1],

@@ -92,6 +92,6 @@ def test_a_number_of_steps_that_is_none_is_refused(steps: object) -> None:
 def test_a_mean_of_other_parameters_is_refused() -> None:
     average = Averaging(torch.nn.Linear(2, 2))
     with pytest.raises(KeyError):
-        average.restore(1, {"average/weight": torch.zeros(2, 2)})
+        average.restore({"average/weight": torch.zeros(2, 2)}, {"averaged": 1})
     with pytest.raises(ValueError, match="average weight"):
-        average.restore(1, {"average/weight": torch.zeros(3, 2)})
+        average.restore({"average/weight": torch.zeros(3, 2)}, {"averaged": 1})

@@ -164,7 +164,7 @@ def test_a_run_goes_on_on_the_kind_of_device_that_it_began_on(
     assert metadata["device"] == "cpu"
     path = tmp_path / "moved"
     safetensors.torch.save_file(tensors, path, metadata={**metadata, "device": "cuda"})
-    with pytest.raises(CheckpointError, match="began on cuda.*--device cuda"):
+    with pytest.raises(CheckpointError, match=r"began on cuda.*--device cuda"):
         resumed(kind, blob_scene, path, config)
 
 

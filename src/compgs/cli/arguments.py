@@ -27,7 +27,7 @@ METAVARS = {int: "INT", float: "FLOAT"}
 
 @dataclass(frozen=True)
 class Refused:
-    """In place of a value that could not be understood, until the name of its option is known."""
+    """Stands for a value that could not be understood, until the name of its option is known."""
 
     complaint: str
 
@@ -105,7 +105,7 @@ def _values() -> ConstructorRegistry:
 
 
 def _value(kind: Any, texts: Sequence[str]) -> Any:
-    """Of the type `kind`, or `Refused`: to raise here would leave the message to the parser."""
+    """Return a value of the type `kind`, or `Refused`: to raise here would leave the message to the parser."""
     try:
         return parse_value(kind, ",".join(texts))
     except ValueError as error:

@@ -184,7 +184,7 @@ class ReadingOptions:
         return chosen_device(getattr(self, "device", None)) == CPU
 
     def given_reading(self) -> dict[str, Any]:
-        """Of the fields of a `SceneSource` those that were given. Raises UsageError."""
+        """Return the fields of a `SceneSource` that were given. Raises UsageError."""
         options = {field.name: field.default for field in dataclasses.fields(ReadingOptions)}
         given = {name: getattr(self, name) for name in options if getattr(self, name) != options[name]}
         if "downscale" in given:
@@ -219,7 +219,7 @@ class SceneOptions(ReadingOptions):
         return self.source_at(one_scene(self.scene, self.source), holdout=holdout)
 
     def source_of_run(self, begun: SceneSource) -> SceneSource:
-        """As a run read its scene; what is given here goes before that. Raises UsageError."""
+        """Return how a run read its scene, with what is given here in its place. Raises UsageError."""
         self.check_reading()
         given = self.given_reading()
         if self.scene or self.source:
@@ -238,7 +238,7 @@ def one_scene(scene: Path | None, source: Path | None) -> Path:
 
 
 def use_threads(count: int) -> None:
-    """Of numba. Raises UsageError."""
+    """Set the number of numba's threads. Raises UsageError."""
     import numba
 
     limit = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
@@ -247,7 +247,7 @@ def use_threads(count: int) -> None:
 
 
 def allow_tmc3() -> None:
-    """From now on, in this process."""
+    """Let this process call tmc3 from now on."""
     from compgs.codec.tmc3 import ASKED_BY
 
     os.environ[ASKED_BY] = "1"

@@ -173,7 +173,7 @@ class Compress(ComputingCommand):
             )
 
     def looking(self) -> "Looking":
-        """From where the splats are looked at."""
+        """Return from where the splats are looked at."""
         from compgs.compressing import Looking
 
         return Looking(

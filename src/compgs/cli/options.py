@@ -36,7 +36,7 @@ class Option:
 
 
 def options_of(kind: type) -> list[Option]:
-    """Of a command, in the order of its fields."""
+    """Return the options of a command, in the order of its fields."""
     hints = typing.get_type_hints(kind, include_extras=True)
     return [_option(field, hints[field.name]) for field in dataclasses.fields(kind)]
 

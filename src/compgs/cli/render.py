@@ -178,7 +178,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
         }
 
     def first_given(self, *options: str) -> str | None:
-        """Of these options the first that was given."""
+        """Return the first of these options that was given."""
         return next((name for name in options if getattr(self, name) is not None), None)
 
     def views_source(self, run: RunSettings | None) -> SceneSource | None:
@@ -198,7 +198,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
         check_video()
 
     def keyframes(self) -> "Sequence[Camera]":
-        """Of a `--path` that is a file. Raises UsageError, SceneError."""
+        """Read the keyframes of a `--path` that is a file. Raises UsageError, SceneError."""
         if self.path in (None, "cameras", "orbit"):
             return []
         from compgs.evaluation.camera_path import read_cameras
@@ -229,7 +229,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
         return [(view.name, view.camera) for view in chosen]
 
     def way(self, model: "Renderable", keyframes: "Sequence[Camera]") -> "Sequence[tuple[str, Camera]]":
-        """Through the given cameras, along the file's, or in a circle. Raises UsageError."""
+        """Return a way through the given cameras, along the file's, or in a circle. Raises UsageError."""
         from compgs.evaluation.tour import tour, way_through
 
         cameras = model.viewpoints

@@ -151,7 +151,7 @@ def _made_by_runs(folder: Path) -> list[Path]:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Of a file's present content; none if there is no file. Files here are replaced, never changed."""
+    """Identify a file's present content; None if there is no file. Files here are replaced, never changed."""
     try:
         found = path.stat()
     except FileNotFoundError:
@@ -180,7 +180,7 @@ def load_settings(folder: Path) -> RunSettings:
 
 
 def run_settings(content: dict[str, Any], place: str) -> RunSettings:
-    """Of what `save_settings` has written, also before there were as many settings: those it lacks are as by default.
+    """Read what `save_settings` has written. Settings that an earlier version did not write have their defaults.
 
     Raises ConfigError, which names the `place`, and what a mapping of another kind raises.
     """
@@ -198,7 +198,7 @@ def run_settings(content: dict[str, Any], place: str) -> RunSettings:
 
 
 def file_and_run(path: Path) -> tuple[Path, RunSettings | None]:
-    """Of a run's folder, or of its file: the file, and the run's settings. Any other path stays as it is.
+    """Return a run's file and its settings, from the run's folder or its file. Any other path stays as it is.
 
     Raises CheckpointError for a folder of a run that has not written its file.
     """
@@ -230,7 +230,7 @@ def _written_by(folder: Path, settings: RunSettings) -> Path:
 
 
 def read_otherwise(begun: SceneSource, now: SceneSource) -> str:
-    """In what a scene is not read as when a run on it began, as options; empty if there is nothing."""
+    """Name, as options, what is read otherwise than when a run on the scene began; empty if nothing is."""
     options = {
         "downscale": "-r",
         "test_every": "--test-every",

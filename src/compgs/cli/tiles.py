@@ -81,7 +81,7 @@ def check_options(command: "Train") -> None:
 
 
 def settings_of_tile(place: str) -> RunSettings:
-    """Of `RUN/plan.json#NAME`: the run's settings, for one of its tiles. Raises UsageError, CheckpointError."""
+    """Return the settings of a tile of the run at `RUN/plan.json#NAME`. Raises UsageError, CheckpointError."""
     from compgs.formats.tiled import ground_entry
     from compgs.tiles.plan import read_plan
 
@@ -197,7 +197,7 @@ def _plan(
 
 
 def _what_counts(settings: RunSettings) -> dict[str, Any]:
-    """Of a run's settings, what its tiles depend on: not where the scene lies now."""
+    """Return what tiles depend on among a run's settings: not where the scene lies now."""
     ordinary = {"split": "auto"}  # runs from before there was another have none
     reading = {
         name: value

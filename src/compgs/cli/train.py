@@ -280,7 +280,7 @@ class Train(ComputingCommand, SceneOptions):
         return self.resume and (folder / CHECKPOINT_NAME).is_file()
 
     def settings(self, folder: Path) -> RunSettings:
-        """From the command line, or of the run to be continued. Raises UsageError, CheckpointError."""
+        """Return the command line's settings, or the begun run's. Raises UsageError, CheckpointError."""
         check_options(self)
         if self.tile is not None and not self.resume:
             return settings_of_tile(self.tile)

@@ -103,7 +103,7 @@ class Dimensions:
         return self.channels(Role.REFERENCE)
 
     def channels(self, role: Role) -> int:
-        """Of all groups of a role together."""
+        """Count the channels of all groups of a role together."""
         return sum(g.channels for g in self.groups if g.role == role)
 
     def network_size(self, group: GroupShape) -> tuple[int, int]:
@@ -114,7 +114,7 @@ class Dimensions:
 
     @property
     def network_sizes(self) -> list[tuple[int, int]]:
-        """Of the networks in the file's order."""
+        """Return inputs and outputs of the networks, in the file's order."""
         return [self.network_size(g) for g in self.groups if g.has_network]
 
     @property
@@ -129,7 +129,9 @@ class Dimensions:
 
     @property
     def head_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of the prediction networks' parameters, by name, in the order of files that leave the names out."""
+        """Return the shapes of the prediction networks' parameters, by name, in the order of files that leave the names
+        out.
+        """
         sizes = HeadDimensions(self.reference_dim, self.residual_dim, self.width)
         shapes = weight_shapes(self.heads, sizes)
         if self.channels(Role.RESIDUAL) == 0:
@@ -142,7 +144,7 @@ class Dimensions:
         return sum(g.width(self.coupled_primitives) for g in self.groups if not g.has_network)
 
     def symbols_per_anchor(self) -> int:
-        """With all coupled primitives."""
+        """Count the symbols of an anchor that has all coupled primitives."""
         return sum(g.width(self.coupled_primitives) for g in self.groups)
 
 
@@ -233,7 +235,7 @@ class Surroundings:
         return slice(self.ends[number - 1] if number else 0, self.ends[number])
 
     def neighbours(self, number: int) -> Neighbours:
-        """Of the anchors of a range, which is not the first."""
+        """Find the neighbours of the anchors of a range, which is not the first."""
         known, end = self.ends[number - 1], self.ends[number]
         return find_neighbours(self.offsets[:end], known, self.depth - self.levels[number - 1])
 
@@ -246,8 +248,8 @@ class Surroundings:
 def surroundings(
     coordinates: np.ndarray, levels: Sequence[int] | None = None, counts: np.ndarray | None = None
 ) -> Surroundings:
-    """Of [N, 3] voxels in canonical order; `levels`: last octree level of each range, by default `chosen_levels`;
-    `counts`: `level_counts`, if that is known.
+    """Find the surroundings of [N, 3] voxels in canonical order; `levels`: last octree level of each range, by default
+    `chosen_levels`; `counts`: `level_counts`, if that is known.
     """
     offsets = coordinates.astype(np.int64) - octree_origin(coordinates)
     depth, counts = octree_depth(offsets), level_counts(coordinates) if counts is None else counts
@@ -300,7 +302,7 @@ def existing_symbols(
 
 
 def gather_existing(slots: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [P, D]
-    """Of [N, K, D], the coupled primitives that exist [N, K], anchor by anchor."""
+    """Gather from [N, K, D] the rows of the coupled primitives that exist [N, K], anchor by anchor."""
     rows = first_rows(mask)
     out = np.empty((int(rows[-1]), slots.shape[2]), np.int32)
     _move_rows(slots, out, mask, rows, True)
@@ -349,7 +351,7 @@ class CodedGroup:
 
     @property
     def rows(self) -> Rows:
-        """Of its stream."""
+        """Return the row layout of the group's stream of symbols."""
         return Rows(self.symbols.shape[1], self.inertia)
 
     def part(self, rows: slice) -> "CodedGroup":

@@ -138,7 +138,7 @@ def pack(sections: list[Section], version: int) -> bytes:
 
 
 def version_of(data: bytes) -> int:
-    """Of a file that `unpack` accepts."""
+    """Return the version of a file that `unpack` accepts."""
     return data[len(MAGIC)]
 
 

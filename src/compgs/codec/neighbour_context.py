@@ -20,7 +20,7 @@ def neighbour_context(
     offsets: np.ndarray,  # [M + n, 3] int32: of these and the range's own
     neighbours: Callable[[], Neighbours],  # asked for only if there are earlier ranges
 ) -> np.ndarray:  # [n, 2 + C] int32, Q12
-    """Of the n anchors of a range."""
+    """Compute the context of the n anchors of a range."""
     centre = centre_of(network)
     out = np.zeros((len(offsets) - len(earlier), BESIDES + len(centre)), np.int32)
     if len(earlier):

@@ -86,8 +86,8 @@ def _spread_table() -> NDArray[np.uint64]:
 
 
 def _child_tables() -> tuple[NDArray[np.uint64], NDArray[np.int64], NDArray[np.int64]]:
-    """Of child c: [8] its 26 surrounding cells; [8, 6] the cells at its faces, -x +x -y +y -z +z; [8, 7] the
-    neighbours of the node that touch it: 3 at faces, 3 at edges (xy, xz, yz), 1 at a corner.
+    """Make the tables of child c: [8] its 26 surrounding cells; [8, 6] the cells at its faces, -x +x -y +y -z +z;
+    [8, 7] the neighbours of the node that touch it: 3 at faces, 3 at edges (xy, xz, yz), 1 at a corner.
     """
     around, faces, touch = np.zeros(8, np.uint64), np.zeros((8, 6), np.int64), np.zeros((8, 7), np.int64)
     for c in range(8):

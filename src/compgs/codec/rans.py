@@ -318,8 +318,8 @@ def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, look
 def _decode_rows_chunk(
     words, begin, end, index, lowest, counts, offsets, cumulative, lookup, first, width, inertia, known, edges, symbols
 ):  # fmt: skip
-    """As `_decode_chunk`, where tables follow their rows; `index` becomes what was used. `first`: channel of the first
-    symbol.
+    """Decode as `_decode_chunk` does, where tables follow their rows; `index` becomes what was used. `first`: channel
+    of the first symbol.
     """
     single = len(symbols) < SINGLE_STATE_SYMBOLS
     position, even, odd = _first_states(words, begin, end, single)

@@ -95,7 +95,7 @@ def with_fitted_rows(content: FileContent) -> FileContent:
 
 
 def best_inertia(coded: CodedGroup) -> int:
-    """Of a group's rows."""
+    """Choose the inertia of a group's rows."""
     bits = [replace(coded, inertia=inertia).bits() for inertia in INERTIAS]
     return INERTIAS[int(np.argmin(bits))]  # the first of equal ones
 
@@ -118,7 +118,7 @@ def _fitted_chain(steps: np.ndarray, index: np.ndarray) -> np.ndarray:  # [C (C 
 
 
 def _best_shift(symbols: np.ndarray, index: np.ndarray, coded: CodedGroup) -> int:
-    """Of a channel's tables."""
+    """Choose the shift of a channel's tables."""
     bits = [_bits(symbols, _moved(index, shift), coded) for shift in TABLE_SHIFTS]
     return TABLE_SHIFTS[int(np.argmin(bits))]
 

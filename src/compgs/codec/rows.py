@@ -32,7 +32,7 @@ _EDGE_BITS = 15
 
 @dataclass(frozen=True)
 class RowContext:
-    """Of a network's group. Raises ValueError for what the format cannot hold."""
+    """Describes how rows of a network's group adapt. Raises ValueError for what the format cannot hold."""
 
     chain: np.ndarray | None = None  # [C (C - 1) / 2] int32, row by row of a triangle, in units of 2^-6
     inertia: int = 0  # 0: tables are as the network gives them
@@ -114,7 +114,7 @@ class Evidence(NamedTuple):
 
 @cache
 def evidence() -> Evidence:
-    """From tables: a division for each symbol would take longer than to decode it."""
+    """Look the evidence up in tables: a division for each symbol would take longer than to decode it."""
     first, seen, expected = [0], [], []
     for size in expected_sizes().tolist():
         capped = -(-SIZE_CAP * size >> 12)
@@ -127,8 +127,9 @@ def evidence() -> Evidence:
 
 @cache
 def shift_edges() -> np.ndarray:  # [2 LARGEST_TABLE_SHIFT + 2] int64
-    """Of each shift, from the lowest on: from which ratio of sizes on, seen to expected, in 2^-15. Below the lowest and
-    above the highest nothing lies."""
+    """Return for each shift, from the lowest on, from which ratio of sizes on it holds, seen to expected, in 2^-15.
+    Below the lowest and above the highest nothing lies.
+    """
     twice = 2 * SCALES_PER_OCTAVE
     shifts = range(-LARGEST_TABLE_SHIFT, LARGEST_TABLE_SHIFT + 1)
     edges = [_root(1 << (twice * _EDGE_BITS + 2 * d - 1), twice) for d in shifts]

@@ -84,7 +84,9 @@ def encode_scene(content: FileContent) -> bytes:
 
 
 def version_for(content: FileContent) -> int:
-    """Of the format, for what a file holds: the newest, but for scenes of files that had no angular dilation."""
+    """Choose the version of the format for what a file holds: the newest, but for scenes of files that had no angular
+    dilation.
+    """
     if content.angular_dilation is not None:
         return FIRST_WITH_ROWS
     sees_neighbours = any(group.shape.sees_neighbours for group in content.groups)

@@ -62,12 +62,12 @@ def _viewpoint(camera: Camera) -> Viewpoint:
 
 
 def _with_lens(view: Viewpoint, lenses: Sequence[tuple[int, int, float, float]]) -> Viewpoint:
-    """Through its own lens, or the most similar one there is."""
+    """Return the view through its own lens, or the most similar one there is."""
     if view.lens in lenses:
         return view
 
     def difference(lens: tuple[int, int, float, float]) -> float:
-        """Of the fields of view first of all, then of the image sizes, in logarithms."""
+        """Compare the fields of view first of all, then the image sizes, in logarithms."""
         width, height, fx, fy = lens
         fields = math.log(width / fx * view.fx / view.width) ** 2
         fields += math.log(height / fy * view.fy / view.height) ** 2

@@ -109,7 +109,7 @@ def write_content(
 
 
 def _heads(content: FileContent, version: int) -> bytes:
-    """By name, or in the order of their names where files have none."""
+    """Read the heads by name, or in the order of their names where files have none."""
     if version < FIRST_WITH_ROWS:
         return encode_heads(content.heads)
     stored = dict(content.heads)

@@ -38,7 +38,7 @@ class Comparison:
 def compare(
     model: SplatModel, views: Sequence[View], formats: Sequence[str] = COMPARED, *, device: str = CPU
 ) -> Comparison:
-    """By the same measure as a file of ours: 8-bit pictures against those of the splats."""
+    """Compare by the same measure as a file of ours: 8-bit pictures against those of the splats."""
     rows, notes = [], []
     with tempfile.TemporaryDirectory() as folder:
         for name in formats:

@@ -113,7 +113,7 @@ def compress(
 
 
 def default_config(preset: str | None = None) -> Config:
-    """Of a preset, or what is meant for compression."""
+    """Return the settings of a preset, or those meant for compression."""
     if preset is not None:
         return load_config(preset)
     config = load_config("default")
@@ -251,7 +251,7 @@ def opened(source: Path, looking: Looking, device: str | None) -> SplatModel:
 
 
 def digest(source: Path) -> str:
-    """By which a file is known again."""
+    """Return a digest by which a file is known again."""
     return hashlib.sha256(source.read_bytes()).hexdigest()
 
 

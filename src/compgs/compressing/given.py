@@ -8,7 +8,7 @@ from compgs.evaluation.camera_path import read_cameras
 
 
 def given_cameras(path: str | Path) -> list[Camera]:
-    """Of a folder or a file (`read_cameras`), in the order of their names.
+    """Read the cameras of a folder or a file (`read_cameras`), in the order of their names.
 
     Raises SceneError, UnsupportedCamera for what holds no cameras, or fewer than two.
     """

@@ -23,7 +23,7 @@ LEAST_SIDE, MOST_SIDE = 16, 4096  # pixels
 
 @dataclass(frozen=True)
 class Looking:
-    """From where, and how, the input is looked at."""
+    """Says from where, and how, the input is looked at."""
 
     views: int = 200  # to train with
     held_out: int = 24  # others, to judge by

@@ -44,7 +44,7 @@ class Lens:
     field_of_view: float = 60.0  # degrees, of the longer side
 
     def camera(self, pose: np.ndarray) -> Camera:
-        """Of a pose [4, 4], world to camera."""
+        """Return the camera of a pose [4, 4], world to camera."""
         focal = max(self.width, self.height) / (2 * np.tan(np.deg2rad(self.field_of_view) / 2))
         return Camera(pose, focal, focal, self.width / 2, self.height / 2, self.width, self.height)
 

@@ -61,7 +61,7 @@ class Quantized:
         return Quantized(references, covariances, residuals, {})
 
     def of(self, part: Tensor | None) -> "Quantized":
-        """Of the rows `part` [V] int64; None: of all."""
+        """Return the rows `part` [V] int64; None: all of them."""
         if part is None:
             return self
         references, covariances, residuals = (latent.index_select(0, part) for latent in self.latents())
@@ -103,7 +103,7 @@ class EntropyModel(nn.Module):
 
     @property
     def context_of_references(self) -> Literal["neighbours", "hyperprior", "none"]:
-        """In the file, before they are decoded."""
+        """Names what the file knows of references before they are decoded."""
         if self.neighbour_network is not None:
             return "neighbours"
         return "hyperprior" if isinstance(self.reference_context, Hyperprior) else "none"

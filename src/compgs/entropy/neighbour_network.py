@@ -24,7 +24,7 @@ class NeighbourNetwork(EntropyNetwork):
         self.follow = nn.Parameter(torch.full((channels,), 0.3))
 
     def layers(self, bits: int | None = None) -> list[tuple[Tensor, Tensor]]:
-        """With the rows of the means, which are zero."""
+        """Return the layers with the rows of the means, which are zero."""
         ((weight, bias),) = super().layers()
         weight = torch.cat([torch.zeros_like(weight[: self.channels]), weight[self.channels :]])
         return [(weight, bias) if bits is None else (quantize_weight(weight, bits), round_fixed(bias))]

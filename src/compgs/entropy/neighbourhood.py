@@ -54,7 +54,9 @@ class Neighbourhood:
 
 
 def neighbourhood(coordinates: Tensor) -> Neighbourhood:
-    """Of the anchors at coordinates [N, 3] int32 voxels, in any order; with the ranges that an encoder would make."""
+    """Find the neighbourhood of the anchors at coordinates [N, 3] int32 voxels, in any order; with the ranges that an
+    encoder would make.
+    """
     voxels = coordinates.cpu().numpy()
     order = canonical_order(voxels)
     ordered = voxels[order].astype(np.int64)

@@ -141,17 +141,17 @@ class Comparison:
 
     @property
     def ssim(self) -> float:
-        """Of b against a."""
+        """Return the mean SSIM of b's pictures, with a's as reference."""
         return fmean(view.ssim for view in self.per_view)
 
     @property
     def lpips(self) -> float | None:
-        """Of b against a, images given in [-1, 1]."""
+        """Return LPIPS of b's pictures against a's, images given in [-1, 1]."""
         return _mean([view.lpips for view in self.per_view])
 
     @property
     def lpips_3dgs(self) -> float | None:
-        """Of b against a, images given in [0, 1]."""
+        """Return LPIPS of b's pictures against a's, images given in [0, 1]."""
         return _mean([view.lpips_3dgs for view in self.per_view])
 
     @property

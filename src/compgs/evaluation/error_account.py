@@ -48,7 +48,7 @@ SHOWN_VIEWS = 6  # views that are kept as pictures, the worst
 
 @dataclass(frozen=True)
 class Part:
-    """Of the squared error."""
+    """Is a part of the squared error."""
 
     share: float  # of all of it
     psnr: float | None  # dB; None where there is no error, or no pixel
@@ -143,7 +143,7 @@ class ErrorSums:
         mask: np.ndarray | None,  # [H, W] bool, True where a pixel counts
         depth: np.ndarray,  # [H, W] world units, infinite where the background shows
     ) -> None:
-        """Of one view."""
+        """Add the error of one view."""
         difference = (rendering.astype(np.float64) - photograph) / 255
         counted = np.ones(depth.shape) if mask is None else mask.astype(np.float64)
         difference *= counted[:, :, None]
@@ -171,7 +171,7 @@ class ErrorSums:
         self._pictures = sorted(self._pictures, key=lambda kept: -kept.squared)[:SHOWN_VIEWS]
 
     def account(self) -> ErrorAccount:
-        """Of all views so far, one at least."""
+        """Return the account of all views so far, one at least."""
         assert self._places is not None, "a view comes first"
         total = sum(squared for _, squared, _ in self._views)
         pixels = sum(count for _, _, count in self._views)

@@ -88,7 +88,7 @@ def _draw_words(
 
 
 def scale_in_words(finer_than: int | None) -> str:
-    """Of a part of the error."""
+    """Say the scale of a part of the error."""
     if finer_than is None:
         return f"{SCALES[-1]} pixels and coarser"
     at = SCALES.index(finer_than)
@@ -96,7 +96,7 @@ def scale_in_words(finer_than: int | None) -> str:
 
 
 def distance_in_words(near: float | None, far: float | None) -> str:
-    """Of a part of the error."""
+    """Say the distance of a part of the error."""
     return "background" if near is None or far is None else f"{near:.3g} to {far:.3g}"
 
 

@@ -42,5 +42,5 @@ def exposed_by_left_half(
 
 
 def right_half(image: np.ndarray) -> np.ndarray:
-    """Of [H, W, ...]: what `exposed_by_left_half` has not looked at."""
+    """Return the half of [H, W, ...] that `exposed_by_left_half` has not looked at."""
     return image[:, image.shape[1] // 2 :]

@@ -34,6 +34,6 @@ def check_view(view: View, *, exposure: bool) -> None:
 
 
 def degrees_to_training(scene: Scene) -> list[float | None]:
-    """Of each held-out view the angle to the nearest training view (`compgs.scene.angles`); None without any."""
+    """Return the angle of each held-out view to the nearest training view (`compgs.scene.angles`); None without any."""
     held_out, trained = ([view.camera for view in views] for views in (scene.test_views, scene.train_views))
     return nearest_angles(held_out, trained, scene.points.positions, scene.extent)

@@ -234,7 +234,7 @@ def write_evaluation(
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Of a [H, W, 3] or [H, W] uint8 image."""
+    """Encode a [H, W, 3] or [H, W] uint8 image."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="PNG")
     return buffer.getvalue()

@@ -139,7 +139,7 @@ def _slerp(a: np.ndarray, b: np.ndarray, part: float) -> np.ndarray:
 
 
 def _between(points: np.ndarray, leg: int, part: float, closed: bool) -> np.ndarray:
-    """On the spline through the points, `part` of the way from one to the next (Barry and Goldman 1988)."""
+    """Return a place on a spline through the points, `part` of the way between two (Barry and Goldman 1988)."""
     n = len(points) - 1
     if not closed:  # beyond its ends it goes straight on, so that it neither starts nor stops slowly
         points = np.concatenate([2 * points[:1] - points[1:2], points, 2 * points[-1:] - points[-2:-1]])

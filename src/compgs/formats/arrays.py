@@ -103,7 +103,7 @@ def drawable(place: Path, arrays: SplatArrays) -> SplatArrays:
 
 
 def _with_limits(arrays: SplatArrays) -> SplatArrays:
-    """With finite numbers in place of infinite ones that mean something; itself where there are none."""
+    """Put finite numbers in place of infinite ones that mean something; the same array where there are none."""
     logits, scales, quaternions = arrays.opacity_logits, arrays.log_scales, arrays.quaternions
     if np.isinf(logits).any():
         most = logit(np.ones(1))[0]

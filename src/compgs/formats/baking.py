@@ -48,7 +48,7 @@ class Baked:
         return Baked(self.splats.rows(index), self.importance[index])
 
     def most_important(self, count: int) -> "Baked":
-        """As many splats as asked for, in the order in which they were."""
+        """Choose as many splats as asked for, in the order in which they were."""
         if count >= len(self.importance):
             return self
         return self.rows(np.sort(np.argpartition(-self.importance, count)[:count]))
@@ -110,7 +110,9 @@ class _Sums:
 
 
 def _add_view(sums: _Sums, model: HybridModel, camera: Camera, settings: RasterSettings) -> None:
-    """Of a camera of the model's frame. A primitive is drawn once in a view: sums need not add up repeated rows."""
+    """Add the view of a camera of the model's frame. A primitive is drawn once in a view: sums need not add up repeated
+    rows.
+    """
     visible = visible_mask(*model.bounds, camera, settings)
     gaussians, drawn = model.drawn(camera, visible)
     shown = gaussians.opacities > CUTOFF  # on a GPU those are there, too, that are not
@@ -142,7 +144,9 @@ def _add_opacities(
     gaussians: Gaussians[np.ndarray],
     drawn: np.ndarray,  # [M] int64, which primitives they are
 ) -> None:
-    """Of all primitives of the anchors in view: those that are not drawn have opacity 0, and count with it."""
+    """Add the opacities of all primitives of the anchors in view: those that are not drawn have opacity 0, and count
+    with it.
+    """
     rows = np.flatnonzero(visible[model.primitives.anchor_index])
     opacities = np.zeros_like(sums.opacity)
     opacities[drawn] = gaussians.opacities

@@ -205,7 +205,7 @@ def splats_of(file: GlbFile) -> SplatArrays:
 
 
 def _splats(file: GlbFile, attributes: dict[str, int]) -> SplatArrays:
-    """Of one primitive, in the frame of its mesh."""
+    """Read the splats of one primitive, in the frame of its mesh."""
     degree = max((d for d in range(MAX_DEGREE + 1) if harmonic_names(d)[-1] in attributes), default=0)
     means = _column(file, attributes, "POSITION", 3)
     harmonics = [_column(file, attributes, name, 3) for name in harmonic_names(degree)]
@@ -382,7 +382,7 @@ def _places(path: Path, gltf: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]
 
 
 def _roots(nodes: list[dict[str, Any]]) -> list[int]:
-    """Of a file without scenes: nodes that are no other's children."""
+    """Return the roots of a file without scenes: nodes that are no other's children."""
     children = {child for node in nodes for child in node.get("children", [])}
     return [index for index in range(len(nodes)) if index not in children]
 

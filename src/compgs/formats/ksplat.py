@@ -71,7 +71,7 @@ class _Level:
     harmonic: str
 
     def row(self, degree: int) -> np.dtype:
-        """Of a splat."""
+        """Return the row of a splat."""
         columns: list[tuple[str, str, int]] = [
             ("mean", self.mean, 3),
             ("scale", self.scale, 3),

@@ -28,7 +28,8 @@ def codebook(values: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def palette(vectors: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most `size` centers [P, C] float32 for vectors [M, C], and for each vector the index of its center [M] int64.
+    """Find at most `size` centers [P, C] float32 for vectors [M, C], and for each vector the index of its center [M]
+    int64.
 
     The group of vectors that is farthest from its middle, in squares, is divided across its longest axis, again and
     again. Where there are hardly fewer centers than vectors this leaves a fraction of the error of centers that are

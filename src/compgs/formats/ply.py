@@ -183,7 +183,9 @@ def read(path: Path) -> SplatArrays:
 
 
 def splats_of(path: Path, header: PlyHeader, table: np.ndarray) -> SplatArrays:
-    """From the vertices, a structured array [count]. Raises SplatFileError where most of them cannot be drawn."""
+    """Read splats from the vertices, a structured array [count]. Raises SplatFileError where most of them cannot be
+    drawn.
+    """
     groups = property_groups(header.held_degree)
     held = header.row.names or ()
 
@@ -273,7 +275,7 @@ def component_bytes(path: Path) -> dict[str, int]:
 
 
 def component_bytes_of(header: PlyHeader) -> dict[str, int]:
-    """Of a file whose vertices are stored as rows; what is left of it is the header's."""
+    """Count the bytes by component of a file whose vertices are stored as rows; what is left of it is the header's."""
     names = header.row.names or ()
     groups = {name: group for group, held in property_groups(header.held_degree).items() for name in held}
     sizes = dict.fromkeys(dict.fromkeys(["header", *(groups.get(name, "others") for name in names)]), 0)
@@ -386,7 +388,7 @@ class _Element:
 
 
 def _elements(path: Path, lines: list[list[str]], expected: tuple[str, ...]) -> list[_Element]:
-    """In the order of the file. Raises SplatFileError for another format than those that are expected."""
+    """Return the elements in the file's order. Raises SplatFileError for a format that is not `expected`."""
     found: list[_Element] = []
     for words in lines[1:]:
         text = " ".join(words)
@@ -405,7 +407,9 @@ def _elements(path: Path, lines: list[list[str]], expected: tuple[str, ...]) -> 
 
 
 def degree_held(path: Path, row: np.dtype) -> int:
-    """Of the harmonics, 0 to 4, from the number of f_rest; every property that is needed must be there."""
+    """Return the degree of the harmonics, 0 to 4, from the number of f_rest; every property that is needed must be
+    there.
+    """
     found = set(row.names or ())
     held = sum(name.startswith("f_rest_") for name in found)
     degrees = {3 * harmonics_above_dc(d): d for d in range(MOST_DEGREE_HELD + 1)}
@@ -430,7 +434,7 @@ def degree_held(path: Path, row: np.dtype) -> int:
 
 
 def _what_is_missing(groups: dict[str, tuple[str, ...]], missing: list[str]) -> str:
-    """In words, with a remedy for what the file seems to be."""
+    """Say what is missing, with a remedy for what the file seems to be."""
     shape = {*groups["opacities"], *groups["scales"], *groups["rotations"]}
     if shape <= set(missing):
         return f"property {missing[0]!r} is missing: these are points, not splats"

@@ -57,7 +57,7 @@ def _header(path: Path) -> ply.PlyHeader:
 
 
 def _fill(numbers: np.ndarray, path: Path, file: BinaryIO, names: tuple[str, ...], before: int) -> None:
-    """With the first numbers of a text, `before` the first of a splat; what follows them belongs to other elements.
+    """Fill an array with a text's first numbers, `before` the first of a splat; others follow of other elements.
 
     Raises SplatFileError.
     """

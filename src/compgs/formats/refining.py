@@ -59,7 +59,9 @@ def with_values(splats: SplatArrays, values: dict[str, np.ndarray]) -> SplatArra
 def _gradients(
     splats: SplatArrays, model: Renderable, camera: Camera, picture: np.ndarray, settings: RasterSettings
 ) -> dict[str, np.ndarray]:
-    """Of the mean squared difference to a picture [H, W, 3] from a camera of the model's frame, by what is fitted."""
+    """Return gradients of the mean squared difference to a picture [H, W, 3] from a camera of the model's frame, by
+    what is fitted.
+    """
     seen = np.flatnonzero(visible_mask(splats.means, splat_radii(splats.log_scales), camera, settings))
     means, rest = splats.means[seen], splats.rest[seen]
     opacities = sigmoid(splats.opacity_logits[seen])

@@ -127,7 +127,9 @@ def scene_name(path: Path) -> str:
 
 
 def format_of(path: Path) -> Format:
-    """Of a file that is there. Raises NotACompGSFile for one that is of no known format, or is no file."""
+    """Return the format of a file that is there. Raises NotACompGSFile for one that is of no known format, or is no
+    file.
+    """
     path = scene_file(path)
     names = ", ".join(dict.fromkeys(f".{each.name}" for each in FORMATS[1:]))
     if path.is_dir():

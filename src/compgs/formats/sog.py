@@ -199,7 +199,7 @@ def check(path: Path) -> None:
 
 
 def read(path: Path) -> SplatArrays:
-    """Of a .sog file, or of a meta.json beside its images. Raises SplatFileError."""
+    """Read a .sog file, or a meta.json beside its images. Raises SplatFileError."""
     return drawable(path, splats(path))
 
 

@@ -118,7 +118,7 @@ def _folder_contents(path: Path) -> dict[str, bytes]:
 
 
 def _folder_images(path: Path, meta: dict[str, Any]) -> dict[str, bytes]:
-    """Of a meta.json: images beside it, and nowhere else."""
+    """Read the images of a meta.json: those beside it, and nowhere else."""
     contents: dict[str, bytes] = {}
     for entry in meta.values():
         for name in entry.get("files", []) if isinstance(entry, dict) else []:

@@ -150,7 +150,7 @@ def encoded(arrays: SplatArrays, version: int = 3) -> bytes:
 
 
 def fractional_bits(arrays: SplatArrays) -> int:
-    """As many as the splats are fine, and as their distance from the origin leaves. Raises SplatFileError."""
+    """Choose as many bits as the splats are fine, and their distance from the origin leaves. Raises SplatFileError."""
     reach = _reach(arrays).max()
     room = int(_room(reach))
     if room < 0:
@@ -298,7 +298,7 @@ def read(path: Path) -> SplatArrays:
 
 
 def _axes(path: Path, header: SpzHeader, records: bytes) -> str:
-    """Of the file, by its extensions; what else they and the flags say is told."""
+    """Return the axes of the file, by its extensions; what else they and the flags say is told."""
     axes, passed_over = USUAL_AXES, []
     if header.degree > MAX_DEGREE:
         passed_over.append(f"harmonics of degree {header.degree}")

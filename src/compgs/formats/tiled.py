@@ -244,7 +244,7 @@ def core_from_entry(entry: dict[str, Any]) -> Core:
 
 
 def ground_entry(ground: GroundAxes) -> dict[str, Any]:
-    """As JSON has it."""
+    """Return the ground as JSON has it."""
     return {name: list(value) for name, value in vars(ground).items()}
 
 

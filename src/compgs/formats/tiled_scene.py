@@ -52,7 +52,9 @@ def tile_memory() -> int:
 
 
 def resident_bytes(model: HybridModel) -> int:
-    """Of a tile's arrays once it has been looked at: what is stored, and the geometry that is predicted of it."""
+    """Count the bytes of a tile's arrays once it has been looked at: what is stored, and the geometry that is predicted
+    of it.
+    """
     p = model.primitives
     anchor = (
         p.positions.itemsize * 3 + p.log_scales.itemsize * 6 + p.references.itemsize * p.references.shape[1]
@@ -232,7 +234,7 @@ class TiledScene:
 
 
 def _moved(gaussians: Gaussians[np.ndarray], shift: np.ndarray) -> Gaussians[np.ndarray]:
-    """From a tile's frame, whose origin lies at `shift` [3], to the scene's."""
+    """Move positions from a tile's frame, whose origin lies at `shift` [3], to the scene's."""
     if not shift.any():
         return gaussians
     return replace(gaussians, means=gaussians.means + shift.astype(np.float32))

@@ -84,7 +84,9 @@ class _Kept:
 
 
 def common_offset(offsets: Sequence[Vector]) -> Vector:
-    """Of the frame in which tiles of these offsets are drawn: theirs if it is one, else their mean in whole units."""
+    """Return the offset of the frame in which tiles of these offsets are drawn: theirs if it is one, else their mean in
+    whole units.
+    """
     if len(set(offsets)) == 1:
         return offsets[0]
     x, y, z = (float(round(value)) for value in np.mean(offsets, axis=0))
@@ -92,7 +94,7 @@ def common_offset(offsets: Sequence[Vector]) -> Vector:
 
 
 def _entry(tile: NewTile, model: HybridModel) -> TileEntry:
-    """With spheres in the tile's own frame."""
+    """Return the entry of a tile, with spheres in its own frame."""
     return TileEntry(
         name=tile.name,
         bytes=len(tile.data),

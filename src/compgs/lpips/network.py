@@ -35,7 +35,7 @@ LEAST_PIXELS = 2 ** (len(STAGES) - 1)  # of a side: after four halvings a pixel 
 
 
 class LpipsDistances(NamedTuple):
-    """Of one pair of pictures, in both conventions; 0 for equal pictures."""
+    """Holds the distances of one pair of pictures, in both conventions; 0 for equal pictures."""
 
     lpips: float  # pictures given as -1 to 1
     lpips_3dgs: float  # pictures given as 0 to 1, as the release of 3DGS does
@@ -50,7 +50,7 @@ class LpipsNetwork:
     heads: tuple["Tensor", ...]  # [channels]
 
     def distances(self, a: np.ndarray, b: np.ndarray) -> LpipsDistances:
-        """Of two uint8 images [H, W, 3]. Raises Unavailable for images that are too small."""
+        """Measure the distances of two uint8 images [H, W, 3]. Raises Unavailable for images that are too small."""
         import torch
 
         if min(a.shape[:2]) < LEAST_PIXELS:

@@ -49,7 +49,9 @@ def find_weights() -> Path:
 
 
 def read_weights(file: str | Path) -> LpipsWeights:
-    """Of a `vgg16.ckpt` or an `.npz`, known by its first bytes. Raises Unavailable that says what is wrong with it."""
+    """Read the weights of a `vgg16.ckpt` or an `.npz`, known by its first bytes. Raises Unavailable that says what is
+    wrong with it.
+    """
     path = Path(file)
     try:
         data = path.read_bytes()

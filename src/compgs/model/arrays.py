@@ -59,8 +59,8 @@ class MLPArrays:
 
     @classmethod
     def of(cls, tensors: Mapping[str, np.ndarray], anchor_dim: int) -> "MLPArrays":
-        """From a network's tensors by the names that docs/bitstream_prediction.md gives them, without the network's own
-        in front; the first `anchor_dim` inputs are the anchor's.
+        """Make it from a network's tensors by the names that docs/bitstream_prediction.md gives them, without the
+        network's own in front; the first `anchor_dim` inputs are the anchor's.
         """
 
         width = len(tensors["input_bias"])

@@ -48,7 +48,7 @@ NETWORKS: dict[str, dict[str, NetworkShape]] = {
 
 
 def weight_shapes(layout: Layout, dimensions: HeadDimensions) -> dict[str, tuple[int, ...]]:
-    """Of all weights of a layout, by name (docs/bitstream_prediction.md)."""
+    """Return the shapes of all weights of a layout, by name (docs/bitstream_prediction.md)."""
     shapes: dict[str, tuple[int, ...]] = {}
     width = dimensions.width
     for network, shape in NETWORKS[layout].items():
@@ -73,7 +73,7 @@ class HeadWeights:
     tensors: Mapping[str, np.ndarray]  # by name; their shapes are `weight_shapes`
 
     def arrays(self) -> HeadArrays:
-        """For the kernels."""
+        """Return the arrays that the kernels take."""
         networks = [
             MLPArrays.of(self._of(network), shape.anchor_dim(self.dimensions.reference))
             for network, shape in NETWORKS[self.layout].items()

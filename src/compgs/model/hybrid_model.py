@@ -68,7 +68,7 @@ class HybridModel:
 
     @functools.cached_property
     def _scene(self) -> SceneArrays:
-        """With its geometry, for the kernels."""
+        """Return the scene with its geometry, for the kernels."""
         return SceneArrays.of(self.heads.arrays(), self.primitives, self.distance_unit)
 
     @property

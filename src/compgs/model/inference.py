@@ -81,7 +81,7 @@ class HeadArrays(ABC):
         """`SceneArrays.drawn` of a scene of these heads."""
 
     def geometry(self, primitives: PrimitiveArrays, first_coupled: np.ndarray) -> GeometryArrays:
-        """Of all coupled primitives."""
+        """Return the geometry of all coupled primitives."""
         p, spread = primitives, primitives.spread()
         geometry = GeometryArrays.empty(len(p.residuals))
         for a in range(0, len(p), BLOCK):

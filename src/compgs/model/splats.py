@@ -41,12 +41,12 @@ class SplatArrays:
 
     @property
     def degree(self) -> int:
-        """Of the harmonics, 0 to 3."""
+        """Return the degree of the harmonics, 0 to 3."""
         return degree_of(self.rest.shape[1])
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
-        """By name what each splat has a row of."""
+        """Return by name what each splat has a row of."""
         names = "means", "log_scales", "quaternions", "opacity_logits", "dc", "rest"
         return {name: getattr(self, name) for name in names}
 
@@ -65,12 +65,12 @@ class SplatArrays:
         return self.each(lambda array: array[index])
 
     def of_degree(self, degree: int) -> "SplatArrays":
-        """Without the harmonics above a degree."""
+        """Leave out the harmonics above a degree."""
         return replace(self, rest=self.rest[:, : harmonics_above_dc(degree)])
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
-    """In the precision of the logits."""
+    """Compute the sigmoid in the precision of the logits."""
     with np.errstate(over="ignore"):
         return 1 / (1 + np.exp(-logits))
 

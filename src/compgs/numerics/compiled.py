@@ -92,12 +92,12 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 
 def rows_a_thread(least: int) -> Callable[..., int]:
-    """For `worth`: among so many threads that each has `least` rows of the last argument or more."""
+    """Return a `worth` with which each thread has `least` rows of the last argument or more."""
     return lambda *arguments: len(arguments[-1]) // least
 
 
 def _options(options: dict[str, Any]) -> dict[str, Any]:
-    """As numba's own njit completes them; an entry for C, which nobody uses, is not compiled."""
+    """Complete the options as numba's own njit does; an entry for C, which nobody uses, is not compiled."""
     return {"nopython": True, "boundscheck": None, "no_cfunc_wrapper": True, **options}
 
 

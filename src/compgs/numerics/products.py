@@ -21,7 +21,7 @@ from compgs.numerics.compiled import njit
 
 
 def _rows() -> int:
-    """Of a block of 16 columns: eight sums at once, a vector register each, are what hides how long one takes."""
+    """Return the rows of a block of 16 columns: eight sums at once, a vector register each, hide how long one takes."""
     features = str(cpu_target.target_context.codegen().magic_tuple()[2])
     return 8 if "+avx512f" in features else 4
 

@@ -21,7 +21,7 @@ NEAREST_WEIGHT = 1 << 24  # of a neighbour at distance 1; others have less in pr
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Of the n anchors of a range: neighbours among the M of the ranges before. Anchors of a node share them."""
+    """Holds the neighbours of a range's n anchors among the M of the ranges before. Anchors of a node share them."""
 
     node: NDArray[np.int32]  # [n] the anchor that represents their node
     around: NDArray[

@@ -182,6 +182,6 @@ def _storable(image: Image.Image) -> Image.Image:
 
 
 def _turned(image: Image.Image, orientation: int) -> Image.Image:
-    """As an orientation tag asks for."""
+    """Turn an image as an orientation tag asks for."""
     image.getexif()[ROTATED] = orientation
     return ImageOps.exif_transpose(image)

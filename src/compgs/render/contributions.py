@@ -20,7 +20,9 @@ class Blended(Protocol):
         ...
 
     def gradients(self, d_image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """By opacities [M] and colors [M, 3], of a number whose gradient by the image is [H, W, 3] float32."""
+        """Return the gradients by opacities [M] and colors [M, 3] of a number whose gradient by the image is [H, W, 3]
+        float32.
+        """
         ...
 
 

@@ -33,7 +33,7 @@ def rasterize_parts(
     camera: Camera,
     settings: RasterSettings = DEFAULT_SETTINGS,
 ) -> RasterResult[np.ndarray]:
-    """Of Gaussians that come in parts, at most `most` together; no two parts need be in memory."""
+    """Rasterize Gaussians that come in parts, at most `most` together; no two parts need be in memory."""
     lists = tile_lists(parts, most, camera, settings)
     image, transmittance, _ = blend(lists, camera, settings)
     return RasterResult(image, transmittance, lists.packed[:, 0:2].copy(), lists.visible)
@@ -92,7 +92,7 @@ def _kept(
 
 
 def contiguous(gaussians: Gaussians[np.ndarray]) -> Gaussians[np.ndarray]:
-    """As the kernels take them: float32, in C order, writable; copies nothing that is so already."""
+    """Return arrays as the kernels take them: float32, in C order, writable; copies nothing that is so already."""
     # Kernels would be compiled anew for arrays that are read-only.
     arrays = (np.require(value, np.float32, ("C", "W")) for value in vars(gaussians).values())
     return Gaussians(*arrays)
@@ -130,7 +130,7 @@ def blend_thresholds(settings: RasterSettings) -> tuple[np.float32, np.float32, 
 
 @dataclass(frozen=True, eq=False)
 class BlendGradients:
-    """Of a number that depends on the image, by what was blended into it, M Gaussians."""
+    """Holds the gradients of a number that depends on the image, by what was blended into it, M Gaussians."""
 
     means2d: np.ndarray  # [M, 2]
     covariances: np.ndarray  # [M, 3]
@@ -194,7 +194,9 @@ class BlendedOnCpu:
     _settings: RasterSettings
 
     def gradients(self, d_image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """By opacities [M] and colors [M, 3], of a number whose gradient by the image is [H, W, 3] float32."""
+        """Return the gradients by opacities [M] and colors [M, 3] of a number whose gradient by the image is [H, W, 3]
+        float32.
+        """
         found = blend_gradients(
             self._lists,
             self._ends,

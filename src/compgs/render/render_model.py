@@ -30,12 +30,14 @@ class Renderable(Protocol):
 
     @property
     def angular_dilation(self) -> float | None:
-        """As `RasterSettings.angular_dilation`; None: the same pixels in pictures of every size."""
+        """Says how far splats are dilated, as `RasterSettings.angular_dilation`; None: the same pixels in pictures of
+        every size.
+        """
         ...
 
     @property
     def antialiased(self) -> bool:
-        """As `RasterSettings.antialiased`."""
+        """Says whether opacities make up for the dilation, as `RasterSettings.antialiased`."""
         ...
 
     @property

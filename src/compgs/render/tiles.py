@@ -78,8 +78,9 @@ def falloff(dx, dy, l00, l10, l11, log2_opacity):
 
 @njit(inline="always")
 def pass_through(t, uncapped, cutoff, cap, stop):
-    """At a pixel of transmittance t: alpha, the weight of the splat's color, the transmittance behind the splat, and
-    whether the pixel is not finished. (Of numbers alone: with an array as argument loops would not be vectorized.)
+    """Compute at a pixel of transmittance t: alpha, the weight of the splat's color, the transmittance behind the
+    splat, and whether the pixel is not finished. (Of numbers alone: with an array as argument loops would not be
+    vectorized.)
     """
     alpha = min(cap, uncapped)
     alpha = alpha if alpha >= cutoff else ZERO

@@ -14,7 +14,9 @@ from compgs.scene.views import View
 
 
 def with_masks(capture: Capture, folder: Path, images: str) -> Capture:
-    """With the mask files that there are, and what is to be noted. Raises SceneError for masks outside of the scene."""
+    """Return the views with the mask files that there are, and what is to be noted. Raises SceneError for masks outside
+    of the scene.
+    """
     names = Names()
     masks = _masks_folder(folder)
     capture = replace(
@@ -45,15 +47,16 @@ def with_masks(capture: Capture, folder: Path, images: str) -> Capture:
 
 
 def _masks_folder(folder: Path) -> Path | None:
-    """In any letter case."""
+    """Find the folder of masks, in any letter case."""
     if (folder / FOLDER).is_dir():
         return folder / FOLDER
     return next((p for p in sorted(folder.iterdir()) if p.is_dir() and p.name.lower() == FOLDER), None)
 
 
 def _mask_of(posed: PosedImage, masks: Path | None, folders: tuple[Path, ...], names: Names) -> Path | None:
-    """In the folder of masks by the photograph's name, relative to the first of `folders` that it is in; else beside
-    the photograph."""
+    """Find a photograph's mask: in the folder of masks by the photograph's name, relative to the first of `folders`
+    that it is in; else beside the photograph.
+    """
     if masks is not None:
         for folder in folders:
             if posed.path.is_relative_to(folder):

@@ -78,7 +78,7 @@ class Names:
 
 
 def matches(named: Iterable[str], names: Iterable[str]) -> dict[str, str]:
-    """Of the names in a list those that mean one of `names` -> which one: with the tolerance of `Names`."""
+    """Return the names in a list that mean one of `names` -> which one: with the tolerance of `Names`."""
     exact, alike = set(names), dict[str, str]()
     for name in sorted(exact):
         alike.setdefault(folded(name), name)

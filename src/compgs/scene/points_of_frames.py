@@ -15,7 +15,9 @@ from compgs.scene.views import Points
 
 
 def points_of(values: Mapping[str, Any], file: Path) -> tuple[Points, tuple[Path, ...], tuple[str, ...]]:
-    """Of `ply_file_path`, else none; the file that was read, and what is to be noted. Raises SceneError."""
+    """Read the points of `ply_file_path`, else none; the file that was read, and what is to be noted. Raises
+    SceneError.
+    """
     nothing = Points(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8))
     ply, folder = values.get("ply_file_path"), file.parent
     if ply is None:

@@ -24,7 +24,7 @@ def split_by_names(
 def split_by_lists(
     posed: Sequence[PosedImage], lists: Mapping[str, frozenset[str]], training: str
 ) -> tuple[tuple[PosedImage, ...], frozenset[str] | None, tuple[str, ...]]:
-    """As `split_by_names`, of lists by what they are called; `training` is the one of frames to train on.
+    """Split as `split_by_names` does, by lists and what they are called; `training` is the one of frames to train on.
 
     Held out is what the other lists have, or, without any, what the list of training frames does not have. Where both
     what is trained on and what is held out are named, other frames are left out, as nerfstudio does.

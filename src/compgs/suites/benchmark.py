@@ -85,7 +85,7 @@ def some_of(suite: Suite, scenes: Sequence[str], methods: Sequence[str]) -> Suit
 
 
 def measurable(suite: Suite) -> tuple[Suite, list[str]]:
-    """Without LPIPS or FLIP where they cannot be measured, which is said: the rest of a table is worth having."""
+    """Leave out LPIPS or FLIP where they cannot be measured, which is said: the rest of a table is worth having."""
     from compgs.metrics import check_flip, lpips_network
 
     notes = []

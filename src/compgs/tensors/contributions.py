@@ -36,7 +36,7 @@ def signed_changes(
     signs: Tensor,  # [H, W, 3] what a change of each value counts
     settings: RasterSettings = DEFAULT_SETTINGS,
 ) -> Tensor:  # [M]
-    """By how much each Gaussian alone changes the image, all values x `signs` summed: with it minus without it.
+    """Return by how much each Gaussian alone changes the image, all values x `signs` summed: with it minus without it.
 
     What is behind a Gaussian shows where it is not. A pixel is affine in a Gaussian's opacity, as long as that does not
     reach the cap: opacity x derivative is the change. Of several Gaussians together the sum is what they change if they

@@ -79,7 +79,7 @@ class _Sampled(torch.autograd.Function):
 
 @njit(error_model="numpy")
 def _sample(gradients, scales, share, start, found, sizes):
-    """Of each primitive all gradients or none; sizes are compared in what no unit of length changes."""
+    """Keep all gradients of a primitive or none; sizes are compared in what no unit of length changes."""
     means, quaternions, spreads, opacities, colors = gradients
     count = len(opacities)
     shown, placed = np.empty(count, np.float32), np.empty(count, np.float32)

@@ -77,7 +77,7 @@ class PredictionHeads(nn.Module):
         return function(self, *arguments)
 
     def networks(self) -> Iterator[tuple[str, ResidualMLP]]:
-        """By the names that the file gives them."""
+        """Yield the networks by the names that the file gives them."""
         for name, network in self.named_children():
             assert isinstance(network, ResidualMLP)
             yield name, network
@@ -119,7 +119,7 @@ class PairedHeads(PredictionHeads):
     def predict_drawn(
         self, primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype = torch.float32
     ) -> Prediction:
-        """On the CPU in float32 one pass of kernels; with it the networks and all around them."""
+        """Predict what is drawn; on the CPU in float32 one pass of kernels computes networks and all around them."""
         if not where.runs_in_kernels(seen.device, seen.dtype, appearance_dtype):
             return super().predict_drawn(primitives, seen, appearance_dtype)
         p = primitives

@@ -40,7 +40,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Of all P coupled primitives, drawn or not: what is the same from everywhere."""
+    """Holds the geometry of all P coupled primitives, drawn or not: what is the same from everywhere."""
 
     means: Tensor  # [P, 3] world units
     scales: Tensor  # [P, 3] standard deviations, world units
@@ -55,7 +55,7 @@ class Geometry:
         return Geometry(*(tensor.detach().requires_grad_() for tensor in self.tensors()))
 
     def of(self, rows: Tensor | None) -> "Geometry":
-        """Of the rows [M] int64, each of them once; None: of all."""
+        """Return the rows [M] int64, each of them once; None: all of them."""
         return self if rows is None else Geometry(*(_Rows.apply(tensor, rows) for tensor in self.tensors()))
 
 
@@ -269,7 +269,7 @@ def predict_geometry(
 
 
 def geometry_of_all(heads: "PredictionHeads", primitives: Primitives) -> Geometry:
-    """Of all coupled primitives."""
+    """Predict the geometry of all coupled primitives."""
     return Geometry(*predict_geometry(heads, primitives, primitives.residuals, primitives.anchor_index))
 
 

@@ -113,7 +113,9 @@ class HybridOnDevice(HybridModel):
     def drawn(
         self, camera: Camera, visible: np.ndarray | None = None
     ) -> tuple[Gaussians[np.ndarray], np.ndarray]:
-        """On a GPU all primitives of the anchors in view, those that are not drawn with opacity 0."""
+        """Return what is drawn; on a GPU all primitives of the anchors in view, those that are not drawn with opacity
+        0.
+        """
         mask = None if visible is None else torch.from_numpy(np.array(visible)).to(self.device)
         gaussians, index = self.drawn_tensors(camera, mask)
         return _arrays(gaussians), _array(index)
@@ -163,7 +165,8 @@ class HybridOnDevice(HybridModel):
         anchors: Tensor,  # [V] int64, ascending
         center: Tensor,  # [3] of the camera, world units
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the anchors' coupled primitives that are drawn: which they are [M], opacities [M], colors [M, 3].
+        """Predict the appearance of the anchors' coupled primitives that are drawn: which they are [M], opacities [M],
+        colors [M, 3].
 
         On a GPU all of them, those that are not drawn with opacity 0.
         """
@@ -248,7 +251,9 @@ class BlendedOnDevice:
         return _array(self.tensor)
 
     def gradients(self, d_image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """By opacities [M] and colors [M, 3], of a number whose gradient by the image is [H, W, 3] float32."""
+        """Return the gradients by opacities [M] and colors [M, 3] of a number whose gradient by the image is [H, W, 3]
+        float32.
+        """
         d_tensor = torch.from_numpy(np.array(d_image)).to(self.tensor)
         inputs = self.opacities, self.colors
         d_opacities, d_colors = torch.autograd.grad(self.tensor, inputs, d_tensor, retain_graph=True)

@@ -33,12 +33,12 @@ class Splats:
 
     @property
     def degree(self) -> int:
-        """Of the spherical harmonics, 0 to 3."""
+        """Return the degree of the spherical harmonics, 0 to 3."""
         return degree_of(self.rest.shape[1])
 
     @classmethod
     def of(cls, arrays: SplatArrays) -> "Splats":
-        """On the CPU; the arrays are copied."""
+        """Make tensors on the CPU from copies of the arrays."""
         named = arrays.columns.items()
         return cls(**{name: torch.from_numpy(np.array(value, np.float32)) for name, value in named})
 

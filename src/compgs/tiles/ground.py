@@ -19,7 +19,7 @@ class Ground(GroundAxes):
 
     @classmethod
     def from_entry(cls, entry: dict[str, Any]) -> "Ground":
-        """Of a plan's JSON. Raises ValueError, KeyError, TypeError."""
+        """Read the ground from a plan's JSON. Raises ValueError, KeyError, TypeError."""
         return cls(**vars(ground_from_entry(entry)))
 
     def places(self, positions: np.ndarray) -> np.ndarray:

@@ -53,7 +53,7 @@ class Tile:
     views: tuple[str, ...]  # names of training views
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return it as JSON has it."""
         return {
             "name": self.name,
             "core": core_entry(self.core),
@@ -180,7 +180,7 @@ def plan_tiles(scene: Scene, columns: int, rows: int) -> Plan:
 
 
 def _cores(places: np.ndarray, weights: np.ndarray, columns: int, rows: int) -> dict[str, Core]:
-    """By name, column by column."""
+    """Return the cores by name, column by column."""
     weights = weights if weights.any() else np.ones(len(places))
     cores = {}
     edges = [-math.inf, *cuts(places[:, 0], weights, columns), math.inf]

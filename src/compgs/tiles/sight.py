@@ -28,7 +28,7 @@ def shares_of_picture(
     positions: np.ndarray,  # [P, 3] of the world
     members: np.ndarray,  # [P, T] bool: points of each tile; a point may be of several
 ) -> np.ndarray:  # [V, T] from 0 to 1
-    """Of what a camera has in its image, the share that is each tile's; a point counts as large as it appears.
+    """Return the share of a camera's image that is each tile's; a point counts as large as it appears.
 
     That is by the inverse square of its distance. A camera that sees no point shows nothing of any tile.
     """

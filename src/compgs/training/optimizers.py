@@ -73,7 +73,7 @@ def set_learning_rates(
     decay: Callable[[float, float, float], float],
     warm_up: float = 0.0,
 ) -> None:
-    """From the first to the last rate of each group; `progress` in 0..1.
+    """Set each group's rate between its first and its last one, by the `progress` in 0 to 1.
 
     In the first `warm_up` of the run the prediction heads come up to their rates from a hundredth of them: at full
     rate they would make the whole scene transparent or white, where nothing has a gradient, before the embeddings can
@@ -93,7 +93,7 @@ def cosine_decay(first: float, last: float, progress: float) -> float:
 
 
 def exponential_decay(first: float, last: float, progress: float) -> float:
-    """By the same factor in every step."""
+    """Fall by the same factor in every step."""
     return first * math.exp(progress * math.log(last / first))
 
 

@@ -285,7 +285,7 @@ class Plan:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return it as JSON has it."""
         return dataclasses.asdict(self)
 
     @classmethod
@@ -418,7 +418,7 @@ def _by_settings(config: Config, start: Start) -> dict[str, Any]:
 
 
 def _expected(plan: Plan) -> dict[str, tuple[bool, str]]:
-    """By field, whether a value from outside is sound, and what was expected."""
+    """Say by field whether a value from outside is sound, and what was expected."""
 
     def whole(name: str, least: int, most: int) -> tuple[bool, str]:
         value = getattr(plan, name)

@@ -132,6 +132,8 @@ def anchor_spacing(coordinates: np.ndarray) -> np.ndarray:
 
 
 def logit(colors: np.ndarray) -> np.ndarray:
-    """Of colors in 0 to 1; black and white have none, and what is nearly so would be far from everything else."""
+    """Return the logits of colors in 0 to 1; black and white have none, and what is nearly so would be far from
+    everything else.
+    """
     clipped = np.clip(colors, 0.05, 0.95)
     return np.log(clipped / (1.0 - clipped))

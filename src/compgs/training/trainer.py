@@ -258,7 +258,7 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        """Of the run, 0 to 1."""
+        """Return the fraction of the run that is done, 0 to 1."""
         return self.step / self.config.training.steps
 
     @torch.no_grad()
@@ -313,7 +313,7 @@ class Trainer:
         stored: bool,
         geometry: Geometry | None = None,
     ) -> Prediction:
-        """On the GPU all primitives of the anchors in view: to choose among them the CPU would have to wait for it."""
+        """Predict the primitives of anchors in view; on the GPU all of them, as choosing would make the CPU wait."""
         model = self.model
         return predict(
             model.heads,
@@ -406,7 +406,7 @@ class Trainer:
         self.choose_head_bits()
 
     def choose_head_bits(self) -> None:
-        """As long as the networks do not compute with weights so rounded."""
+        """Choose the bits of the heads' weights, as long as the networks do not compute with weights so rounded."""
         if not self.stored:
             start, anchors = self.plan.start, self.model.anchors
             self.model.head_bits = head_bits(self.config, start, self.rate.lmbda, anchors)

@@ -58,7 +58,7 @@ class CameraPath:
         return way_through(self.views, frames=count, width=width, height=height)
 
     def content(self) -> bytes:
-        """Of a camera file."""
+        """Return the content of a camera file."""
         entries = [camera_entry(camera, f"view {i}") for i, camera in enumerate(self.views)]
         return json.dumps(entries, indent=2).encode()
 

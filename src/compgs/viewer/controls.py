@@ -44,7 +44,7 @@ class Stopped(Exception):
 
 
 class Controls:
-    """Of one visitor."""
+    """Holds the controls of one visitor."""
 
     def __init__(self, client: "viser.ClientHandle", visitor: Visitor) -> None:
         self.client = client
@@ -290,7 +290,7 @@ class Controls:
         self._edit(lambda: None)
 
     def _camera(self) -> Camera:
-        """Of the world, as the page's is now."""
+        """Return a camera of the world, as the page's is now."""
         return self.visitor.in_world(self.lens().camera())
 
     def _edit(self, change: Callable[[], object]) -> None:

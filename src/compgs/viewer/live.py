@@ -134,7 +134,7 @@ def _new_server(host: str, port: int, label: str) -> "viser.ViserServer":
     import viser
 
     class Server(viser.ViserServer):
-        """Without the tunnel to a public address that any visitor could ask for."""
+        """Serves without the tunnel to a public address that any visitor could ask for."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None

@@ -143,13 +143,15 @@ def _prefixes(path: Path) -> list[tuple[int, str]]:
 
 
 def _beside(model: Renderable) -> Camera:
-    """Of the world, where a file keeps no camera."""
+    """Return a camera of the world, for a file that keeps none."""
     ((_, camera),) = orbit(model.bounds[0], frames=1, width=640, height=480)
     return camera.moved(-np.array(model.world_offset))
 
 
 def radius(positions: np.ndarray) -> float:
-    """Of three quarters of the positions [N, 3] around their median: the far background does not count."""
+    """Return the radius of three quarters of the positions [N, 3] around their median: the far background does not
+    count.
+    """
     middle = np.median(positions, axis=0)
     return max(float(np.quantile(np.linalg.norm(positions - middle, axis=1), 0.75)), 1e-9)
 

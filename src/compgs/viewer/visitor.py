@@ -39,7 +39,7 @@ class Lens:
     height: int
 
     def camera(self, share: float = 1.0) -> Camera:
-        """Of pictures whose sides are this share of the canvas's."""
+        """Return the camera of pictures whose sides are this share of the canvas's."""
         share = min(share, MAX_SIDE / max(self.width, self.height))
         width, height = max(1, round(share * self.width)), max(1, round(share * self.height))
         rotation = rotation_from_quaternion(self.quaternion).T
@@ -138,7 +138,7 @@ class Visitor:
                 self.page.fail(str(error) or "not enough memory")
 
     def wait(self) -> bool:
-        """Until there is something to draw, and it rests or moves on; False: no more."""
+        """Wait until there is something to draw, and it rests or moves on; False: no more."""
         with self._condition:
             while not self._closed:
                 left = self._rests_from - self.clock()

@@ -113,7 +113,7 @@ def shares_chart(rows: Sequence[tuple[str, Sequence[float], str]], names: Sequen
 
 @dataclass(frozen=True)
 class _Scale:
-    """From values to units of the drawing."""
+    """Maps values to units of the drawing."""
 
     axis: Axis
     low: float  # values, or their logarithms
@@ -141,7 +141,7 @@ class _Scale:
 
 
 def _even_ticks(low: float, high: float) -> list[float]:
-    """At 1, 2 or 5 times a power of ten."""
+    """Place ticks at 1, 2 or 5 times a power of ten."""
     rough = (high - low) / TICKS
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * (1 - 1e-9))
@@ -150,7 +150,7 @@ def _even_ticks(low: float, high: float) -> list[float]:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """At powers of ten, and at 2 and 5 or 3 times those where there is room."""
+    """Place ticks at powers of ten, and at 2 and 5 or 3 times those where there is room."""
     factors = (1, 2, 5) if high - low < 1.6 else (1, 3) if high - low < 3 else (1,)
     decades = range(math.floor(low), math.ceil(high) + 1)
     ticks = [factor * 10.0**decade for decade in decades for factor in factors]
@@ -204,7 +204,7 @@ def _line(series: Series, across: _Scale, upward: _Scale) -> list[str]:
 
 
 def _bars(point: Point, x: float, y: float, across: _Scale, upward: _Scale, ink: str) -> list[str]:
-    """Of the spread over seeds."""
+    """Draw bars for the spread over seeds."""
     parts = []
     if point.y_spread:
         low, high = (upward(point.y + side * point.y_spread) for side in (-1, 1))

@@ -25,7 +25,7 @@ class ComparisonPage:
         self._kept: list[_Kept] = []
 
     def keep(self, row: "ComparedView", pictures: dict[str, np.ndarray]) -> None:
-        """Of one view: `a`, `b`, `difference` and perhaps `gt`, the photograph."""
+        """Keep the pictures of one view: `a`, `b`, `difference` and perhaps `gt`, the photograph."""
         height, width = pictures["a"].shape[:2]
         small = {name: reduced(picture, WIDTH) for name, picture in pictures.items()}
         self._kept.append(_Kept(row, small, width, height))

@@ -60,14 +60,14 @@ def reduced(image: np.ndarray, width: int) -> np.ndarray:
 
 
 def webp(image: np.ndarray, width: int) -> bytes:
-    """Of a [H, W, 3] uint8 image, at most `width` pixels wide."""
+    """Encode a [H, W, 3] uint8 image, at most `width` pixels wide."""
     buffer = io.BytesIO()
     Image.fromarray(reduced(image, width)).save(buffer, format="WEBP", quality=QUALITY, method=4)
     return buffer.getvalue()
 
 
 def data_url(data: bytes) -> str:
-    """Of WebP."""
+    """Return a data: URL that holds the image as WebP."""
     return f"data:image/webp;base64,{base64.b64encode(data).decode('ascii')}"
 
 

@@ -87,7 +87,7 @@ class _Figure:
         ]
 
     def html(self, urls: Sequence[str]) -> str:
-        """With the data URLs of `images`."""
+        """Return the page with the data URLs of `images`."""
         pictures = [page.Picture("photograph", urls[0])]
         for layer, url, errors in zip(self.layers, urls[1::2], urls[2::2], strict=True):
             quality = "identical" if layer.psnr == float("inf") else f"{layer.psnr:.2f} dB"
@@ -102,7 +102,7 @@ def named(point: Point) -> str:
 
 
 def _figures(scene: str, points: Sequence[Point], views: int) -> tuple[list[_Figure], list[str]]:
-    """Of one scene, the worst views first; and what is left out."""
+    """Draw the figures of one scene, the worst views first; and say what is left out."""
     chosen = shown_points(points)
     figures = []
     if views and chosen:
@@ -120,8 +120,9 @@ def _figures(scene: str, points: Sequence[Point], views: int) -> tuple[list[_Fig
 
 
 def shown_points(points: Sequence[Point]) -> list[Point]:
-    """Of one scene's points with pictures, at most SHOWN_RUNS: of each method the one whose size is nearest to that of
-    all, then the others, the smallest first and the largest next."""
+    """Choose at most SHOWN_RUNS of one scene's points with pictures: of each method the one whose size is nearest to
+    that of all, then the others, the smallest first and the largest next.
+    """
     pictured = [point for point in points if point.runs[0].folder and "pictures" not in point.runs[0].missing]
     if not pictured:
         return []

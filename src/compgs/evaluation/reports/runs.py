@@ -171,7 +171,9 @@ def _method(config: Mapping[str, Any], folder: Path) -> str:
 
 
 def _rate(config: Mapping[str, Any], settings: Mapping[str, Any], training: Mapping[str, Any]) -> str:
-    """Of ours lambda, or the size that was asked for; of others the preset of their own, and lambda if they have it."""
+    """Name the rate of a run: of ours lambda, or the size that was asked for; of others the preset of their own, and
+    lambda if they have it.
+    """
     own = config.get("method", OURS) != OURS
     preset = config.get("preset", "default")
     parts = [str(preset)] if own and preset not in PRESETS else []

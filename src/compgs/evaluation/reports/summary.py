@@ -18,7 +18,7 @@ ALL_SCENES = "mean of all scenes"
 
 @dataclass(frozen=True)
 class Measure:
-    """Of quality, over which curves are drawn and compared."""
+    """Is a measure of quality, by which curves are drawn and compared."""
 
     key: str
     title: str
@@ -94,7 +94,9 @@ def _number(run: Run, name: str) -> float | None:
 
 
 def points_of(runs: Sequence[Run]) -> list[Point]:
-    """By scene, then by method, both in the order in which they first come; of a method the smallest files first."""
+    """Group points by scene, then by method, both in the order in which they first come; of a method the smallest files
+    first.
+    """
     groups: dict[tuple[str, str, str], list[Run]] = {}
     for run in runs:
         groups.setdefault((run.scene, run.method, run.rate), []).append(run)
@@ -107,12 +109,12 @@ def points_of(runs: Sequence[Run]) -> list[Point]:
 
 
 def scenes(of: Sequence[Run] | Sequence[Point]) -> list[str]:
-    """In the order in which they first come."""
+    """List the scenes in the order in which they first come."""
     return list(dict.fromkeys(each.scene for each in of))
 
 
 def methods(of: Sequence[Run] | Sequence[Point]) -> list[str]:
-    """In the order in which they first come."""
+    """List the methods in the order in which they first come."""
     return list(dict.fromkeys(each.method for each in of))
 
 
@@ -232,7 +234,7 @@ def bd_rate_table(points: Sequence[Point], reference: str) -> Table | None:
 
 
 def _mean_bd_rates(rows: Sequence[tuple[Value, ...]]) -> list[tuple[Value, ...]]:
-    """Of the methods that have a curve on every scene, if there are several."""
+    """Average the BD-rates of the methods that have a curve on every scene, if there are several."""
     found = {row[0] for row in rows}
     by_method = {row[1]: [other for other in rows if other[1] == row[1]] for row in rows}
     return [

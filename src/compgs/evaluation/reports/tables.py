@@ -51,7 +51,7 @@ class Table:
         return [dict(zip(keys, row, strict=True)) for row in self.rows]
 
     def without_empty_columns(self) -> "Table":
-        """Without columns in which nothing is known."""
+        """Leave out columns in which nothing is known."""
         kept = [i for i in range(len(self.columns)) if any(row[i] is not None for row in self.rows)]
         columns = tuple(self.columns[i] for i in kept)
         return Table(
@@ -95,7 +95,7 @@ def to_csv(table: Table) -> str:
 
 
 def to_markdown(table: Table) -> str:
-    """With the title as a heading."""
+    """Return the table as Markdown, with the title as a heading."""
     head = [_for_markdown(column.title) for column in table.columns]
     rule = ["---:" if column.form else "---" for column in table.columns]
     lines = [f"## {_for_markdown(table.title)}", ""]

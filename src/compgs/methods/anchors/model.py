@@ -79,7 +79,7 @@ class AnchorModel(nn.Module):
         return self.coordinates.to(torch.float32) * self.voxel_size
 
     def values(self) -> AnchorValues:
-        """As they are, unquantized."""
+        """Return the values as they are, unquantized."""
         return AnchorValues(
             self.positions(),
             self.features,
@@ -90,7 +90,7 @@ class AnchorModel(nn.Module):
 
     @torch.no_grad()
     def as_hybrid_model(self) -> AnchorScene:
-        """To be rendered, as it is now: a copy."""
+        """Return a copy of the model as it is now, to be rendered."""
         v = self.values()
 
         def array(tensor: Tensor) -> np.ndarray:
@@ -126,5 +126,5 @@ def initial_anchors(kind: type[AnchorModel], scene: Scene, config: Config) -> An
 
 
 def control_settings(config: Config) -> Config:
-    """For `AdaptiveControl`: nothing is pruned or weighed by a rate there."""
+    """Return settings for `AdaptiveControl` with which nothing is pruned or weighed by a rate."""
     return replace(config, control=replace(config.control, rate_exponent=0.0))

@@ -33,7 +33,7 @@ class ViewNetworks(nn.Module):
             self.get_parameter(tensor_name("opacity", "bias", 2)).abs_().add_(OPACITY_BIAS)
 
     def weights(self) -> dict[str, Tensor]:
-        """By name."""
+        """Return the weights by name."""
         return dict(self.named_parameters())
 
     def of(self, name: str) -> list[nn.Parameter]:

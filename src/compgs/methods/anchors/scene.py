@@ -16,12 +16,12 @@ BLOCK = 1 << 12  # anchors that are looked at together: memory stays near the si
 
 
 def tensor_name(network: str, kind: str, layer: int) -> str:
-    """Of a weight or bias, as files have it."""
+    """Return the name of a weight or bias, as files have it."""
     return f"{network}_{kind}{layer}"
 
 
 def network_shapes(feature_dim: int, coupled: int, width: int) -> dict[str, tuple[int, ...]]:
-    """By name, as files have to hold them."""
+    """Return the shapes by name, as files have to hold them."""
     shapes: dict[str, tuple[int, ...]] = {}
     for name, channels in NETWORKS.items():
         for layer, (inputs, outputs) in enumerate(
@@ -115,7 +115,7 @@ class AnchorScene:
             yield self._seen(chosen[start : start + BLOCK], camera.center.astype(np.float32))
 
     def _seen(self, rows: np.ndarray, center: np.ndarray) -> Gaussians[np.ndarray]:
-        """From `center` [3], of the anchors in `rows` [V]."""
+        """Return how the anchors in `rows` [V] are seen from `center` [3]."""
         seen = np.concatenate(
             [self.features[rows], view_embedding(self.positions[rows], center, self.frame)], 1
         )

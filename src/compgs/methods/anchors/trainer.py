@@ -99,7 +99,7 @@ class AnchorTrainer:
 
     @property
     def progress(self) -> float:
-        """Of the run, 0 to 1."""
+        """Return the fraction of the run that is done, 0 to 1."""
         return self.step / self.config.training.steps
 
     @property
@@ -141,7 +141,7 @@ class AnchorTrainer:
         return None
 
     def weights(self) -> dict[str, Tensor]:
-        """Of the networks, as this step computes with them."""
+        """Return the networks' weights, as this step computes with them."""
         return self.model.networks.weights()
 
     @torch.no_grad()
@@ -212,7 +212,7 @@ class AnchorTrainer:
         return self.model.as_hybrid_model()
 
     def estimated_bytes(self) -> int:
-        """Of all numbers in single precision."""
+        """Count the bytes of all numbers in single precision."""
         return 4 * sum(p.numel() for p in self.model.parameters())
 
     def finish(self) -> None:

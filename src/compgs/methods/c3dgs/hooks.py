@@ -123,13 +123,13 @@ class SharedEntries(Hooks):
         )
 
     def estimated_bytes(self, trainer: "SplatTrainer") -> int:
-        """Before DEFLATE."""
+        """Estimate the bytes before DEFLATE."""
         entries = (self.dc, self.rest, self.scales, self.quaternions)
         return SPLAT_BYTES * len(trainer.parameters) + sum(entry.numel() for entry in entries)
 
     @torch.no_grad()
     def content(self, trainer: "SplatTrainer") -> Packed:
-        """Of the file, after the last step."""
+        """Return the content of the file, after the last step."""
         splats = trainer.parameters.trained()
         tensors = {
             "means": splats.means - self.center,

@@ -27,7 +27,7 @@ from compgs.tensors.visibility import visible_mask
 def sensitivities(
     splats: Splats, cameras: Sequence[Camera], settings: RasterSettings
 ) -> tuple[Tensor, Tensor]:
-    """Of colors and of shapes, [M] float32 each, 1 / pixel."""
+    """Measure the sensitivities of colors and of shapes, [M] float32 each, 1 / pixel."""
     black = replace(settings, background=(0.0, 0.0, 0.0))
     count, coefficients = len(splats), 1 + splats.rest.shape[1]
     colors = splats.means.new_zeros(count, coefficients)

@@ -11,7 +11,7 @@ ROWS, COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 
 
 def covariances(scales: Tensor, quaternions: Tensor) -> Tensor:  # [M, 3], [M, 4] -> [M, 6]
-    """Of scales and (unnormalized) rotations."""
+    """Compute the covariances of scales and (unnormalized) rotations."""
     turned = rotation_matrices(quaternions) * scales[:, None]
     return (turned @ turned.transpose(1, 2))[:, ROWS, COLUMNS]
 

@@ -109,5 +109,5 @@ def splat_bytes(codes: int, harmonics_codes: int, degree: int, *, bit_quantized:
 
 
 def codebook_bytes(codes: int, harmonics_codes: int, degree: int) -> int:
-    """Of the four codebooks, and of how many splats have each rotation."""
+    """Count the bytes of the four codebooks, and of how many splats have each rotation."""
     return 4 * (11 * codes + (3 * harmonics_above_dc(degree) * harmonics_codes))

@@ -145,7 +145,7 @@ class LearnedCodebooks(Hooks):
         return round(count * per_splat) + codebook_bytes(k, rest, degree)
 
     def content(self, trainer: "SplatTrainer") -> Packed:
-        """Of the file, after the last step."""
+        """Return the content of the file, after the last step."""
         splats = trainer.parameters.trained()
         codes = self.codes(splats)
         if not codes:  # a run of a step or so

@@ -21,7 +21,7 @@ BLOCK = 1 << 15  # places at once
 
 
 def network_shapes(features: int) -> tuple[tuple[int, int], ...]:
-    """Of the weights, inputs by outputs; there are no biases."""
+    """Return the shapes of the weights, inputs by outputs; there are no biases."""
     return (features + DIRECTION_NUMBERS, HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, 3)
 
 

@@ -71,7 +71,7 @@ class Compact(Hooks):
 
     @property
     def weights(self) -> list[Tensor]:
-        """Of the network, layer by layer."""
+        """Return the network's weights, layer by layer."""
         return [getattr(self, name) for name in self.weight_names]
 
     @property

@@ -30,7 +30,7 @@ class CosaContent:
 
 
 def scene_of(content: CosaContent) -> AnchorScene:
-    """To be rendered."""
+    """Return the scene that the content describes, to be rendered."""
 
     def natural(group: str) -> np.ndarray:
         step = np.float32(content.steps[group] * 2.0**-FRACTION_BITS)

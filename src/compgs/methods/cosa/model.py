@@ -71,7 +71,7 @@ class CosaModel(AnchorModel):
 
     @torch.no_grad()
     def begin(self) -> None:
-        """From now on the anchors are coded: fix the cube of the coordinates, and start from what the values are."""
+        """Code the anchors from now on: fix the cube of the coordinates, and start from what the values are."""
         coordinates = self.coordinates.cpu().numpy()
         origin = octree_origin(coordinates)
         self.origin.copy_(torch.from_numpy(origin))
@@ -115,7 +115,7 @@ class CosaModel(AnchorModel):
         return soft + (self.kept().to(soft.dtype) - soft).detach()
 
     def seen(self, chained: Chained, masks: Tensor | None) -> AnchorValues:
-        """As prediction takes them."""
+        """Return the values as prediction takes them."""
         v = {group: value * self.chain.step(group) for group, value in chained.values.items()}
         offsets = v["offset"].view(self.anchors, -1, 3)
         return AnchorValues(self.positions(), v["feature"], offsets, v["position_scale"], v["size"], masks)
@@ -132,17 +132,17 @@ class CosaModel(AnchorModel):
     # the file ------------------------------------------------------------------------------------------------------
 
     def stored_weights(self) -> dict[str, Tensor]:
-        """Of the rendering networks, as the file will hold them, straight-through."""
+        """Return the rendering networks' weights as the file will hold them, straight-through."""
         return {name: quantize_weight(w, self.weight_bits(w)) for name, w in self.networks.weights().items()}
 
     def weight_bits(self, weight: Tensor) -> int:
-        """Of a weight or bias of the rendering networks, in the file."""
+        """Return the bits of a weight or bias of the rendering networks, in the file."""
         bits = self.config.cosa.head_bits
         return bits if weight.dim() > 1 else max(BIAS_BITS, bits)
 
     @torch.no_grad()
     def estimated_bytes(self) -> int:
-        """Of the file, without writing it."""
+        """Estimate the bytes of the file, without writing it."""
         latents = float(self.total_bits(self.chained(None).bits, self.kept().float()))
         networks = 0.0
         for network in self.chain.networks.children():

@@ -52,7 +52,7 @@ class CosaTrainer(AnchorTrainer):
         return self.config.training.lmbda
 
     def values(self) -> AnchorValues:
-        """From the second phase on with noise, which stands for rounding, and masks."""
+        """Return the values; from the second phase on with noise, which stands for rounding, and masks."""
         if self.step < self.rate_at:
             return self.model.values()
         if not self.model.begun:
@@ -80,7 +80,7 @@ class CosaTrainer(AnchorTrainer):
         return super().weights()
 
     def finish_step(self) -> None:
-        """In the second phase, anchors that have no primitive left go, as often as growth came in the first."""
+        """Remove, in the second phase, anchors that have no primitive left, as often as growth came in the first."""
         super().finish_step()
         if self.model.begun and (self.step - self.rate_at) % self.schedule.every == 0:
             self.drop_empty()

@@ -92,7 +92,7 @@ class _Rounding:
 
 
 def _integers(network: nn.Module, bits: int) -> IntegerNetwork:
-    """As the decoder evaluates it."""
+    """Return the network as the decoder evaluates it."""
     if isinstance(network, EntropyNetwork):
         return integer_network(network, bits)
     assert isinstance(network, ContextNetwork)

@@ -59,7 +59,9 @@ def _splats() -> SplatConfig:
 
 @dataclass(frozen=True)
 class EaglesConfig(Config):
-    """With its own schedule of growth: each 125 steps until 18 000 of 30 000, resets each 2 500."""
+    """Holds the settings of EAGLES, with its own schedule of growth: each 125 steps until 18 000 of 30 000, resets each
+    2 500.
+    """
 
     splats: SplatConfig = field(default_factory=_splats)
     eagles: EaglesSection = field(default_factory=EaglesSection)

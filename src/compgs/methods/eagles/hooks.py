@@ -86,7 +86,7 @@ class Latents(Hooks):
         return self.cosines.to(weights.device) * weights if name == "harmonics" else weights
 
     def decode(self) -> dict[str, Tensor]:
-        """By the fields of `Splats`, differentiable."""
+        """Decode the values by the fields of `Splats`, differentiably."""
         latents = {a.name: self.latents(a.name) for a in self.attributes}
         rounded = {name: straight_through(values, values.round()) for name, values in latents.items()}
         found = {a.field: rounded[a.name] @ self.decoder(a.name) for a in self.attributes}
@@ -100,7 +100,7 @@ class Latents(Hooks):
 
     @torch.no_grad()
     def codes(self) -> dict[str, Code]:
-        """As the file holds them."""
+        """Return the codes as the file holds them."""
         return {
             a.name: Code(
                 _array(self.latents(a.name).round().to(torch.int32)),
@@ -177,7 +177,7 @@ class Latents(Hooks):
 
     @torch.no_grad()
     def estimated_bytes(self, trainer: SplatTrainer) -> int:
-        """By the entropy of each attribute's histogram."""
+        """Estimate the bytes by the entropy of each attribute's histogram."""
         symbols = (self.latents(a.name).round().view(-1) for a in self.attributes)
         bits = sum(_entropy_bits(values) for values in symbols)
         decoders = sum(getattr(self, f"{a.name}_decoder").numel() for a in self.attributes)
@@ -185,7 +185,7 @@ class Latents(Hooks):
 
 
 def image_scale(progress: float, smallest: float, until: float) -> float:
-    """From `smallest` to 1 by half a cosine, over the share `until` of a run."""
+    """Rise from `smallest` to 1 by half a cosine, over the share `until` of a run."""
     if progress >= until:
         return 1.0
     return smallest + (1 - smallest) * 0.5 * (1 - math.cos(math.pi * progress / until))

@@ -70,7 +70,7 @@ def splats_of(packed: Packed) -> SplatArrays:
 
 
 def half(values: np.ndarray) -> np.ndarray:
-    """In half precision; larger values than that can hold are its largest."""
+    """Round to half precision; larger values than that can hold are its largest."""
     return np.clip(values, -MOST_HALF, MOST_HALF).astype(np.float16)
 
 

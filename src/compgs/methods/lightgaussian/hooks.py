@@ -112,7 +112,7 @@ def significance(trainer: "SplatTrainer", volume_power: float) -> Tensor:
 
 
 def entries(section: LightGaussianSection, splats: int, degree: int) -> int:
-    """Of the codebook, for so many splats."""
+    """Return the entries of the codebook, for so many splats."""
     other = splats * splat_bytes(section.coded, section.codebook, degree)
     return entries_within(
         section.codebook, other, lambda codes: codebook_bytes(codes, degree), section.codebook_share
@@ -120,7 +120,7 @@ def entries(section: LightGaussianSection, splats: int, degree: int) -> int:
 
 
 def estimated_bytes(trainer: "SplatTrainer", section: LightGaussianSection) -> int:
-    """Before DEFLATE."""
+    """Estimate the bytes before DEFLATE."""
     count = len(trainer.parameters)
     degree = min(section.degree, degree_of(trainer.parameters.rest.shape[1]))
     codes = max(1, min(entries(section, count, degree), int(section.coded * count)))
@@ -129,7 +129,7 @@ def estimated_bytes(trainer: "SplatTrainer", section: LightGaussianSection) -> i
 
 @torch.no_grad()
 def content(trainer: "SplatTrainer", config: LightGaussianConfig) -> Packed:
-    """Of the file, after the last step."""
+    """Return the content of the file, after the last step."""
     section, device = config.lightgaussian, trainer.device
     splats = trainer.parameters.trained()
     splats = replace(splats, rest=splats.rest[:, : harmonics_above_dc(section.degree)])

@@ -9,7 +9,9 @@ def entries_within(
     bytes_of: Callable[[int], float],  # bytes of the codebooks of so many entries, growing with them
     share: float,  # of the file that they may take; 1: whatever they take
 ) -> int:
-    """As many as published, or half as many, and so on, until the codebooks take at most a share of the file."""
+    """Return as many entries as published, or half as many, and so on, until the codebooks take at most a share of the
+    file.
+    """
     entries = published
     while entries > 1 and share < 1 and bytes_of(entries) > share / (1 - share) * other_bytes:
         entries = (entries + 1) // 2

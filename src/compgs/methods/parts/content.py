@@ -17,7 +17,7 @@ Offset = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """Of a file that is not written yet; `compgs.render` takes it."""
+    """Is the content of a file that is not written yet; `compgs.render` takes it."""
 
     packed: Packed
     background: tuple[float, float, float]  # RGB, 0 to 1, of the scene: files of splats keep none
@@ -26,7 +26,7 @@ class Content:
     device: "Device" = "cpu"
 
     def as_hybrid_model(self) -> "Renderable":
-        """As a reader of the file would have it."""
+        """Return the scene as a reader of the file would have it."""
         return self.opens(self.packed, self.device, self.background)
 
     def write(self, path: Path) -> int:

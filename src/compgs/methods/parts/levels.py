@@ -20,7 +20,7 @@ class Levels:
 
     @staticmethod
     def of(values: np.ndarray, bits: int = 8) -> "Levels":
-        """Of an array [...] float32, with at least one value; at most 16 bits."""
+        """Quantize an array [...] float32, with at least one value, to at most 16 bits."""
         assert 1 <= bits <= 16, bits
         low = values.min()
         step = (values.max() - low) / np.float32((1 << bits) - 1)
@@ -34,7 +34,7 @@ class Levels:
             return np.float32(self.low) + self.codes.astype(np.float32) * np.float32(self.step)
 
     def facts(self, name: str) -> dict[str, float]:
-        """For the header of a file, of an array of that name."""
+        """Return what the header of a file says of an array of that name."""
         return {f"{name}.low": self.low, f"{name}.step": self.step}
 
 

@@ -16,7 +16,7 @@ from compgs.tensors.visibility import visible_mask
 def blending_weights(
     splats: Splats, cameras: Iterable[Camera], settings: RasterSettings
 ) -> Iterator[tuple[Camera, Tensor]]:
-    """For each camera (of the splats' frame) the sums over its pixels of transmittance x alpha, [M] float32."""
+    """Return for each camera (of the splats' frame) the sums over its pixels of transmittance x alpha, [M] float32."""
     for camera in cameras:
         weights = splats.means.new_zeros(len(splats))
         rows = torch.nonzero(visible_mask(splats.means, splat_radii(splats), camera, settings)).view(-1)

@@ -36,8 +36,8 @@ class FileSize:
         return sum(self.model.estimated_bits(mask).values()) / 8 + self._geometry(mask)
 
     def written_share(self) -> float:
-        """Of these bytes, what a file takes as it would be written now: its rows say more of themselves than training
-        pays for (`codec/rows.py`).
+        """Return the share of these bytes that a file takes as it would be written now: its rows say more of themselves
+        than training pays for (`codec/rows.py`).
         """
         return max(1.0, len(encoded(self.model)[0]) - fixed_bytes(self.model)) / max(1.0, self.latents())
 

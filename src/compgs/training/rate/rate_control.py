@@ -44,7 +44,7 @@ class RateState:
 
     @staticmethod
     def restored(values: dict[str, Any]) -> "RateState":
-        """Of a checkpoint. Raises ValueError, TypeError for what is no state."""
+        """Read the state of a checkpoint. Raises ValueError, TypeError for what is no state."""
         state = RateState(**values)
         numbers = (state.lmbda, state.error or 0.0, state.share, state.slow or 0.0, state.written)
         if not all(math.isfinite(number) for number in numbers):

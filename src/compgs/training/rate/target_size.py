@@ -68,8 +68,8 @@ class TargetSize:
         return follow(state, size * state.written * state.share, target, progress=step / t.steps, grown=grown)
 
     def bits_that_stay(self, step: int, bits: Tensor, written: float) -> tuple[float, float]:
-        """Of all `bits` [N] of the anchors, after a pruning at this step: with fewer than the first no lambda would
-        bring the file to its size, and with more than the second after the last pruning none would in time.
+        """Return the fewest and most of the anchors' `bits` [N] that a pruning at this step may leave. With fewer no
+        lambda would bring the file to its size; with more after the last pruning none would in time.
 
         `written`: of the bytes that training pays for, what a file takes as yet. What is saved becomes less as the run
         settles; reckoned is with half of it (110 kB of plush, 1 500 steps: with all of it +4.4 %, with none -3.9 %).

@@ -48,7 +48,7 @@ def launched() -> bool:
 
 
 def local_device(device: torch.device) -> torch.device:
-    """On a machine with several GPUs each rank has its own."""
+    """Return the rank's own device, on a machine with several GPUs."""
     if device.type == "cuda" and device.index is None and launched():
         return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
     return device
@@ -104,7 +104,8 @@ def on_any_rank(*flags: bool) -> tuple[bool, ...]:
 
 @torch.no_grad()
 def sum_gradients(parameters: Iterable[nn.Parameter], *others: Tensor) -> None:
-    """Of the parameters, over all ranks; and the `others`, small tensors of any shape, which are changed.
+    """Sum the gradients of the parameters over all ranks; and the `others`, small tensors of any shape, which are
+    changed.
 
     A parameter of which no rank has a gradient stays without one, and the optimizer leaves it alone.
     """

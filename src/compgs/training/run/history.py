@@ -24,7 +24,9 @@ class History:
         self.reports.append(status)
 
     def curve(self) -> dict[str, list[Any]]:
-        """At most MOST_POINTS of `step`, `primitives`, `estimated_bytes`, `loss` and `psnr` (dB, training views)."""
+        """Return at most MOST_POINTS of `step`, `primitives`, `estimated_bytes`, `loss` and `psnr` (dB, training
+        views).
+        """
         if not self.reports:
             return {name: [] for name in (*LATEST, *AVERAGED)}
         group = math.ceil(len(self.reports) / MOST_POINTS)
@@ -41,6 +43,6 @@ class History:
 
 
 def _mean(values: list[float]) -> float:
-    """Of those that are finite, if any is: a picture without an error has an infinite PSNR."""
+    """Average those that are finite, if any is: a picture without an error has an infinite PSNR."""
     finite = [value for value in values if math.isfinite(value)]
     return fmean(finite or values)

@@ -59,7 +59,7 @@ class StepProfile:
         trainer.backward, trainer.train_step = watched_backward, watched_step
 
     def milliseconds(self) -> dict[str, float]:
-        """Per step, by part, in the order in which the parts come."""
+        """Return the milliseconds of a step by part, in the order in which the parts come."""
         return {part: 1e3 * seconds / max(1, self.steps) for part, seconds in self.seconds.items()}
 
     def _timed(self, method: Callable[..., Any], part: str) -> Callable[..., Any]:

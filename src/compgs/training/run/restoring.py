@@ -79,7 +79,7 @@ def check_moments(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor
 
 
 def check_step(state: Mapping[str, Any], steps: int) -> None:
-    """Of the run's state. Raises ValueError for a step outside of the run."""
+    """Check the step of the run's state. Raises ValueError for a step outside of the run."""
     whole_number(state["step"], 0, steps, "step")
 
 

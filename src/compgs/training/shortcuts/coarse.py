@@ -46,7 +46,9 @@ class CoarseViews:
         self.kept: dict[tuple[int, int], tuple[Camera, Target]] = {}
 
     def look(self, view: int, camera: Camera, progress: float) -> tuple[Camera, Target]:
-        """At a `progress` of the run, 0 to 1; the target has the view's exposure where exposures are learned."""
+        """Return camera and target at a `progress` of the run, 0 to 1; the target has the view's exposure where
+        exposures are learned.
+        """
         times = halvings(progress, self.until, camera.width, camera.height)
         if times == 0:
             return camera, self.views.photograph(view)

@@ -25,7 +25,7 @@ from compgs.training.run.restoring import check_tensor
 
 
 class HiddenAnchors:
-    """Of each training view, the anchors that hardly showed when it last looked at them."""
+    """Remembers for each training view the anchors that hardly showed when it last looked at them."""
 
     def __init__(self, share: float, views: int, shape: tuple[int, int], device: torch.device) -> None:
         """`share`: of the mean gradient, below which an anchor is hidden; 0: none is. `shape`: N, K."""
@@ -36,7 +36,7 @@ class HiddenAnchors:
         self.hidden = torch.zeros(anchors, -(-remembered // 8), dtype=torch.uint8, device=device)
 
     def others(self, view: int, rows: Tensor) -> Tensor:
-        """Of the anchors `rows` [V] int64 those that are not hidden in a view."""
+        """Return the anchors among `rows` [V] int64 that are not hidden in a view."""
         if self.share <= 0.0:
             return rows
         return rows[(self.hidden[rows, view // 8] & (1 << view % 8)) == 0]
@@ -44,8 +44,8 @@ class HiddenAnchors:
     def observe(
         self, view: int, rows: Tensor, prediction: Prediction, gaussians: Gaussians, sizes: GradientSizes
     ) -> None:
-        """After the backward pass of a view: its anchors [V], their prediction, the Gaussians that were drawn of it (of
-        opacity 0: left out by chance), and how large their gradients were.
+        """Look at a view after its backward pass: its anchors [V], their prediction, the Gaussians that were drawn of
+        it (of opacity 0: left out by chance), and how large their gradients were.
         """
         if self.share <= 0.0:
             return
@@ -69,7 +69,7 @@ class HiddenAnchors:
         self.hidden = torch.cat([self.hidden[kept], none])
 
     def tensors(self) -> dict[str, Tensor]:
-        """For a checkpoint."""
+        """Return the tensors that a checkpoint holds."""
         return {"hidden": self.hidden}
 
     def state(self) -> dict[str, Any]:
@@ -77,8 +77,8 @@ class HiddenAnchors:
         return {}
 
     def restore(self, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
-        """From a checkpoint; what one rank remembered is of no use to several, which remember nothing, nor the other
-        way round. Raises ValueError, KeyError, IndexError for a damaged one.
+        """Take back what a checkpoint holds; what one rank remembered is of no use to several, which remember nothing,
+        nor the other way round. Raises ValueError, KeyError, IndexError for a damaged one.
         """
         hidden = tensors["hidden"]
         anchors, columns = self.hidden.shape

@@ -49,7 +49,7 @@ class Hooks(nn.Module):
     slowing: float = 1.0
 
     def begin(self, trainer: "SplatTrainer") -> None:
-        """Before the first step, not when a run is resumed: make what depends on the splats there are."""
+        """Make what depends on the splats there are, before the first step; not when a run is resumed."""
 
     def view(self, camera: Camera, photograph: Target, trainer: "SplatTrainer") -> tuple[Camera, Target]:
         """What this step looks at: the view as it is, a smaller one, another picture of it."""
@@ -67,13 +67,15 @@ class Hooks(nn.Module):
         """Right after splats were cloned, split and removed."""
 
     def after_step(self, trainer: "SplatTrainer") -> None:
-        """After each step; `trainer.step` is the number of steps done."""
+        """Act after each step; `trainer.step` is the number of steps done."""
 
     def finish(self, trainer: "SplatTrainer") -> None:
-        """After the last step. Called again if the finished run is resumed: the second time must change nothing."""
+        """Act after the last step. It is called again if the finished run is resumed: the second time must change
+        nothing.
+        """
 
     def estimated_bytes(self, trainer: "SplatTrainer") -> int | None:
-        """Of the file, if it were written now; None: those of a .ply file."""
+        """Estimate the bytes of the file if it were written now; None: those of a .ply file."""
         return None
 
 

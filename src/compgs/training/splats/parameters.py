@@ -131,7 +131,7 @@ def _replace_rows(
 
 
 def of_degree(splats: Splats, degree: int) -> Splats:
-    """With harmonics up to `degree`: those above it are left out, missing ones are zero."""
+    """Return splats with harmonics up to `degree`: those above it are left out, missing ones are zero."""
     count = coefficients(degree) - 1
     missing = splats.rest.new_zeros(len(splats), max(0, count - splats.rest.shape[1]), 3)
     return replace(splats, rest=torch.cat([splats.rest[:, :count], missing], 1))

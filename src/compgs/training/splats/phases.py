@@ -74,7 +74,7 @@ def train_phases(
 
 
 def _phase_of(run: Run, phases: int) -> int:
-    """In which the run to be continued was; 0 for a new one."""
+    """Return the phase in which the run to be continued was; 0 for a new one."""
     if run.earlier is None:
         return 0
     _, metadata = read_checkpoint_file(run.earlier, run.method)

@@ -156,7 +156,9 @@ class SplatTrainer:
         return len(self.parameters)
 
     def degree(self) -> int:
-        """Of the harmonics in use: it rises with the run, so that colors settle before their variation."""
+        """Return the degree of the harmonics in use: it rises with the run, so that colors settle before their
+        variation.
+        """
         s, steps = self.config.splats, self.config.training.steps
         every = round(s.harmonics_every * steps)
         return min(s.harmonics, self.step // max(1, every)) if s.harmonics_every > 0 else s.harmonics
@@ -184,7 +186,7 @@ class SplatTrainer:
 
     @property
     def progress(self) -> float:
-        """Of this phase of the run, 0 to 1."""
+        """Return the fraction of this phase that is done, 0 to 1."""
         return self.step / self.config.training.steps
 
     def draw(self, index: int) -> Drawn:
@@ -226,7 +228,7 @@ class SplatTrainer:
         self.views.learn(self.progress, views, exposures)
 
     def learning_rate(self, first: float, last: float, progress: float) -> float:
-        """Of a group, at some progress of the phase."""
+        """Return the learning rate of a group, at some progress of the phase."""
         return exponential_decay(first, last * self.hooks.slowing, progress)
 
     def observe(self, rendered: RasterResult, camera: Camera) -> None:
@@ -296,7 +298,7 @@ class SplatTrainer:
         self.hooks.finish(self)
 
     def snapshot(self) -> SplatModel:
-        """Before any `transform`, for which a hook may draw random numbers."""
+        """Return the splats before any `transform`, for which a hook may draw random numbers."""
         return self.model()
 
     def model(self) -> SplatModel:
@@ -370,7 +372,7 @@ class SplatTrainer:
 
 
 def checked_splats(tensors: dict[str, Tensor]) -> Splats:
-    """Of a checkpoint. Raises ValueError and the like for what does not belong together."""
+    """Read the splats of a checkpoint. Raises ValueError and the like for what does not belong together."""
     count, harmonics = len(tensors["means"]), tensors["rest"].shape[1]
     shapes = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_logits": (), "dc": (3,)}
     for name, shape in {**shapes, "rest": (harmonics, 3)}.items():

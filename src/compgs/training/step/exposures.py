@@ -68,7 +68,7 @@ class Exposures:
         self.change[view] -= rate * means[0] / (means[1].sqrt() + EPSILON)
 
     def tensors(self) -> dict[str, Tensor]:
-        """For a checkpoint."""
+        """Return the tensors that a checkpoint holds."""
         return {
             "exposure/change": self.change,
             "exposure/moments": self.moments,

@@ -29,7 +29,7 @@ class SeenAnchors:
 
     @property
     def numbers(self) -> list[int]:
-        """Of the views that may show any."""
+        """List the numbers of the views that may show any anchor."""
         return [n for n, part in self.parts.items() if len(self.rows if part is None else part)]
 
     def part_of(self, number: int) -> Tensor | None:
@@ -53,14 +53,14 @@ class StepViews:
     seed: int | None  # of the places of the step's noise; None, with one view: where `noise` is just now
 
     def noise_of_latents(self) -> Noise:
-        """For the anchors of `own`, as if noise for all that are seen had been asked for."""
+        """Return noise for the anchors of `own`, as if noise for all that are seen had been asked for."""
         noise = self._noise(0)
         if self.own is self.seen:
             return noise
         return noise_of_some(noise, torch.searchsorted(self.seen.rows, self.own.rows), len(self.seen.rows))
 
     def noise_of_view(self, number: int) -> Noise:
-        """For what one of the views alone needs."""
+        """Return noise for what one of the views alone needs."""
         return self._noise(1 + number)
 
     def _noise(self, kind: int) -> Noise:
@@ -75,7 +75,7 @@ def step_views(
     anchors: int,  # how many there are
     noise: UniformNoise,
 ) -> StepViews:
-    """Of the views that come next."""
+    """Gather the anchors and the noise of the views that come next."""
     several = len(views) > 1
     seed = int(noise.places.integers(1 << 62)) if several else None
     seen = seen_anchors(dict(enumerate(rows)), anchors)
@@ -86,7 +86,7 @@ def step_views(
 
 
 def seen_anchors(of_views: dict[int, Tensor], anchors: int) -> SeenAnchors:
-    """From the anchors that each view may show, [V] int64, ascending; `anchors`: how many there are."""
+    """Unite the anchors that each view may show, [V] int64, ascending; `anchors`: how many there are."""
     if len(of_views) == 1:
         ((number, rows),) = of_views.items()
         return SeenAnchors(rows, {number: None})

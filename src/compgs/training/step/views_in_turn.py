@@ -77,7 +77,9 @@ class ViewsInTurn:
         return target if self.exposures is None else replace(target, exposure=self.exposures.of(index))
 
     def exposure_gradients(self, views: Sequence[int]) -> tuple[Tensor, ...]:
-        """Of a step's views, as far as this rank rendered them, the others 0: to be summed over the ranks."""
+        """Return the exposures' gradients of a step's views, as far as this rank rendered them, the others 0: to be
+        summed over the ranks.
+        """
         return () if self.exposures is None else (self.exposures.gradients(views),)
 
     def learn(self, progress: float, views: Sequence[int], gradients: Sequence[Tensor]) -> None:
@@ -86,8 +88,8 @@ class ViewsInTurn:
             self.exposures.learn(progress, views, gradients[0])
 
     def stored(self, index: int) -> Target:
-        """On the CPU it shares the memory of the view's image, which the scene keeps or reads again; it is copied to a
-        GPU once and kept there while there is room.
+        """Return a view's photograph. On the CPU it shares the memory of the view's image, which the scene keeps or
+        reads again. It is copied to a GPU once and kept there while there is room.
         """
         if self.device.type == "cpu":
             return Target.from_image(self.views[index].image, mask=self.views[index].mask)
@@ -100,7 +102,7 @@ class ViewsInTurn:
         return kept[index]
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint, as JSON takes it; `views` are the names by which a scene is known again."""
+        """Return what a checkpoint holds, as JSON takes it; `views` are the names by which a scene is known again."""
         return {
             "order": self.order,
             "shuffle": self.chance.bit_generator.state,
@@ -108,7 +110,7 @@ class ViewsInTurn:
         }
 
     def tensors(self) -> dict[str, Tensor]:
-        """For a checkpoint."""
+        """Return the tensors that a checkpoint holds."""
         return {} if self.exposures is None else self.exposures.tensors()
 
     def restore(self, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:

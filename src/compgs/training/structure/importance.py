@@ -18,7 +18,7 @@ from compgs.tensors.prediction import Prediction
 
 
 def spread(views: Sequence[View], most: int) -> Sequence[View]:
-    """At most `most` of the views, evenly spread over their order."""
+    """Choose at most `most` of the views, evenly spread over their order."""
     if len(views) <= most:
         return views
     return [views[i * len(views) // most] for i in range(most)]
