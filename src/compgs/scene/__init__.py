@@ -117,7 +117,7 @@ def check_reading(
     background: tuple[float, float, float] | None,
     split: str = "auto",
 ) -> None:
-    """Of the arguments of `load_scene`: raises ConfigError for the first that no scene could be read by."""
+    """Check the arguments of `load_scene`. Raises ConfigError for the first that no scene could be read by."""
     if downscale != AUTO and not (
         isinstance(downscale, int | float) and 1 <= downscale <= MAX_DOWNSCALE and int(downscale) == downscale
     ):

@@ -13,7 +13,7 @@ LONGEST_SIDE = 1_600  # pixels that it leaves of the longer side, as 3DGS does
 
 
 def turned(capture: Capture) -> Capture:
-    """With images turned by their orientation tag where their cameras are of turned ones, and a sentence about it."""
+    """Turn images by their orientation tag where their cameras are of turned ones, and say so in a note."""
     images = turned_as_cameras_are(capture.images)
     count = sum(posed.turned for posed in images)
     if not count:
