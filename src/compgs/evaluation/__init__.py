@@ -1,4 +1,17 @@
-"""Evaluation: a decoded file against held-out views; rate-distortion curves (CompGS Sec. 4)."""
+"""Evaluation: a decoded file against held-out views; rate-distortion curves (CompGS Sec. 4).
+
+| file | does |
+|---|---|
+| `measure`, `results` | measures a file on held-out views: `evaluate`, and what it returns |
+| `comparison` | puts two files of one scene side by side, without photographs |
+| `reduction` | makes a file smaller without training, and measures what that loses |
+| `bd_rate` | compares two curves of quality over bytes |
+| `held_out`, `fit`, `exposure` | checks the views before they are measured, and adjusts their exposure |
+| `importance` | measures what a primitive adds to the pictures |
+| `error_account`, `error_sheet`, `contact_sheet` | show where the error is, and the pictures beside the photographs |
+| `camera_path`, `capture_cameras`, `tour`, `video` | cameras without photographs, and films along them |
+| `reports/` | the pages and tables that `compgs report` and `compgs compare` write |
+"""
 
 from compgs.evaluation.bd_rate import bd_rate
 from compgs.evaluation.comparison import Comparison, compare

@@ -1,1 +1,12 @@
-"""Arithmetic that several rooms share: linear layers, sums, SSIM, rotations."""
+"""Arithmetic that several rooms share, and the compiling, keeping and running of kernels.
+
+| file | does |
+|---|---|
+| `compiled` | `njit`, as every kernel of the package uses it |
+| `kernel_cache` | keeps compiled kernels between processes |
+| `ahead`, `compiling` | compile kernels side by side, and say that some is being compiled |
+| `crew` | shares a kernel's work among threads |
+| `products`, `vector_sums` | small matrix products and sums, in kernels |
+| `ssim` | structural similarity with its gradient, on the CPU |
+| `rotations`, `nearest` | quaternions, and nearest neighbours |
+"""

@@ -1,4 +1,20 @@
-"""What was captured: `load_scene` finds the layout of a folder and reads views, poses and points."""
+"""What was captured: `load_scene` finds the layout of a folder and reads views, poses and points.
+
+| file | does |
+|---|---|
+| `views`, `points`, `world` | what a scene is: views, points, and the frame that it is trained in |
+| `capture` | what the reader of each layout hands over, before any pixel is read |
+| `colmap`, `colmap_capture`, `colmap_writer` | COLMAP's models and data sets |
+| `blender`, `nerfstudio`, `transforms`, `frames`, `points_of_frames`, `ply_points` | layouts with poses in JSON |
+| `images`, `image_cache`, `pixels`, `sizes` | photographs: read, kept, converted, reduced |
+| `lenses`, `undistort` | lens distortion, and how it is taken out |
+| `masks`, `mask_files` | which pixels count |
+| `names`, `text_files` | names and texts as other programs write them |
+| `hold_out`, `split_names`, `angles` | which views are held out, and how far they are from the others |
+| `sight`, `viewpoints` | what cameras see, and the few that stand for all |
+| `no_poses`, `unused` | what to say of folders without poses, and of files that are not used |
+| `generated`, `ray_tracing` | a generated scene |
+"""
 
 import itertools
 from collections.abc import Sequence

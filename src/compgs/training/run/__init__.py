@@ -3,6 +3,7 @@
 | file | does |
 |---|---|
 | `loop` | goes through the steps, reports progress, and stops at any time |
+| `parts` | what a run remembers, written once for all trainers |
 | `checkpoint`, `restoring` | write and read what a run needs to go on |
 | `distributed` | shares a step among the processes of a torchrun |
 | `profile`, `history` | say where the time went, and how the quality rose |
