@@ -84,10 +84,11 @@ def photometric_loss(
         y = y.to(image.dtype) / 255.0
     if counted is None:
         return (1.0 - ssim_weight) * (image - y).abs().mean() + ssim_weight * (1.0 - ssim(image, y))
-    if not counted.any():
-        return 0.0 * image.sum()
-    l1 = (image - y)[counted].abs().mean()
-    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim(image, y, counted))
+    # By products and sums: which pixels count is not asked, as the answer would have to come from the GPU.
+    pixels = counted.sum()
+    l1 = ((image - y).abs() * counted[:, :, None]).sum() / (3 * pixels.clamp_min(1))
+    loss = (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim(image, y, counted))
+    return loss * (pixels > 0)
 
 
 class _FusedPhotometric(torch.autograd.Function):

@@ -28,4 +28,6 @@ def ssim(x: Tensor, y: Tensor, counted: Tensor | None = None) -> Tensor:
     m, n, xx, yy, xy = blur(maps).view(5, 3, *x.shape[:2])
     similarity = (2 * m * n + C1) * (2 * (xy - m * n) + C2)
     similarity = similarity / ((m * m + n * n + C1) * (xx - m * m + yy - n * n + C2))
-    return similarity.mean() if counted is None else similarity[:, counted].mean()
+    if counted is None:
+        return similarity.mean()
+    return (similarity * counted).sum() / (3 * counted.sum().clamp_min(1))

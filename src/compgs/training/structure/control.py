@@ -136,8 +136,9 @@ class AdaptiveControl:
         )
         slots = rows[prediction.index // k] * k + prediction.index % k
         drawn = norms > 0
-        self.gradient.view(-1).index_put_((slots,), norms, accumulate=True)
-        self.drawn.view(-1).index_put_((slots,), drawn.to(norms.dtype), accumulate=True)
+        # Each slot comes once, so that nothing is summed by atomics, and nothing sorted, on a GPU.
+        self.gradient.view(-1).index_add_(0, slots, norms)
+        self.drawn.view(-1).index_add_(0, slots, drawn.to(norms.dtype))
         self.seen[rows] += 1
         self.opacity[rows] += prediction.opacities.clamp_min(0).view(-1, k).sum(1)
 
