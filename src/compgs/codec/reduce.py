@@ -4,7 +4,7 @@ Both work on what the file holds and leave alone what other symbols are conditio
 their symbols, so that everything that is kept decodes to what it was. Only where anchors see neighbours, and some of
 these go, are there other symbols for the same. Residual embeddings keep their step: most
 of their symbols are 0, 1 or -1, and a coarser step either leaves those where they are or loses them all (measured in
-docs/log/2026-11-21-sizes.md).
+docs/results/tried.md).
 """
 
 from collections.abc import Sequence

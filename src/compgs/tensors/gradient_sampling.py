@@ -3,7 +3,7 @@
 Of what is drawn of a view, most hardly shows: half of the primitives have a hundredth of all gradients, and cost the
 backward pass of the networks as much as the others. Of these some are taken by chance, each with a probability that
 goes with its gradient, which becomes as much larger: the expectation is the same, the variance hardly grows
-(docs/log/2026-11-25-27-sampling.md), and whatever has no gradient is passed over by the kernels.
+(docs/results/tried.md), and whatever has no gradient is passed over by the kernels.
 """
 
 from collections.abc import Callable

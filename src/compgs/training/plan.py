@@ -120,19 +120,19 @@ RULES: tuple[Rule, ...] = (
         "coarser_grid", "voxel_spacings", _voxels,
         "lambda above 0.002: voxels grow with its power model.voxel_rate_exponent",
         lambda s: s.lmbda > USUAL_LAMBDA,
-        "log/2026-11-24-21-context.md",
+        "results/decisions.md",
     ),
     Rule(
         "twice_coupled", "coupled_primitives", lambda c, s, k: min(2 * k, MOST_COUPLED),
         "22 training views and fewer, lambda up to 1e-4",
         lambda s: s.few and s.lmbda <= 1e-4,
-        "log/2026-11-24-22-time.md",
+        "results/decisions.md",
     ),
     Rule(
         "own_residuals_few", "residuals", lambda c, s, own: True,
         "22 training views and fewer, lambda up to 0.001",
         lambda s: s.few and s.lmbda <= 1e-3,
-        "log/2026-11-23-15-residuals.md",
+        "results/decisions.md",
     ),
     # 46 passes were enough; with 23 to 43 shared ones were better. On Truck own ones, separate heads and K = 10 are
     # together 0.45 dB worse in a third more bytes (docs/results/truck.md).
@@ -140,33 +140,33 @@ RULES: tuple[Rule, ...] = (
         "own_residuals_many", "residuals", lambda c, s, own: True,
         "23 training views and more, 45 passes and more, fewer than 20,000 anchors, lambda up to 1e-5",
         lambda s: not s.few and not s.large and s.often(45) and s.lmbda <= 1e-5,
-        "log/2026-11-23-16-top.md",
+        "results/decisions.md",
     ),
     Rule(
         "separate_heads", "heads", lambda c, s, heads: "separate",
         "45 passes and more, fewer than 20,000 anchors, lambda up to 1e-5",
         lambda s: not s.large and s.often(45) and s.lmbda <= 1e-5,
-        "log/2026-11-23-17-heads.md",
+        "results/decisions.md",
     ),
     # Fox with lambda 0.001 (a price of 1.2e-7) is better with 32, plush (1.6e-7) with 16.
     Rule(
         "width_16", "width", lambda c, s, width: min(width, 16),
         "lambda / anchors of 1.4e-7 and more",
         lambda s: s.costs(1.4e-7),
-        "log/2026-11-25-31-figures.md",
+        "results/decisions.md",
     ),
     Rule(
         "width_8", "width", lambda c, s, width: min(width, 8),
         "lambda / anchors of 1.5e-6 and more",
         lambda s: s.costs(1.5e-6),
-        "log/2026-11-23-13-networks.md",
+        "results/decisions.md",
     ),
     # In so small a file a context hardly saves what its network costs.
     Rule(
         "no_context", "reference_context", lambda c, s, context: "none",
         "lambda / anchors of 6e-7 and more",
         lambda s: s.costs(6e-7),
-        "log/2026-11-24-21-context.md",
+        "results/decisions.md",
     ),
     # On Truck weights of 7 bits lose 0.08 dB at -r 2, by which the curve there rises with a fifth more bytes.
     Rule(
@@ -180,19 +180,19 @@ RULES: tuple[Rule, ...] = (
         "one_bit_less", "head_bits", lambda c, s, bits: c.entropy.head_bits - 1,
         "lambda / anchors of 3e-6 and more",
         lambda s: s.costs(3e-6),
-        "log/2026-11-23-13-networks.md",
+        "results/decisions.md",
     ),
     Rule(
         "two_bits_less", "head_bits", lambda c, s, bits: c.entropy.head_bits - 2,
         "lambda / anchors of 3e-5 and more",
         lambda s: s.costs(3e-5),
-        "log/2026-11-23-13-networks.md",
+        "results/decisions.md",
     ),
     Rule(
         "sharp", "dilation", lambda c, s, pixels: min(pixels, LEAST_DILATION),
         "23 training views and more, lambda up to 0.002",
         lambda s: not s.few and s.lmbda <= 0.002,
-        "log/2026-11-24-25-dilation.md",
+        "results/decisions.md",
     ),
     # Followed in a run, as lambda changes (`growth_factor`).
     Rule(
@@ -205,31 +205,31 @@ RULES: tuple[Rule, ...] = (
         "dropout", "dropout", lambda c, s, share: c.training.left_out * s.fewness,
         "fewer than 30 training views: training.left_out where 15 or fewer",
         lambda s: s.fewness > 0,
-        "log/2026-11-22-11-few-views.md",
+        "results/decisions.md",
     ),
     Rule(
         "bit_discount", "bit_discount", lambda c, s, share: c.control.prune_less * s.fewness,
         "fewer than 30 training views: control.prune_less where 15 or fewer",
         lambda s: s.fewness > 0,
-        "log/2026-11-22-11-few-views.md",
+        "results/decisions.md",
     ),
     Rule(
         "coarse_photographs", "coarse_until", lambda c, s, share: c.training.coarse_until,
         "photographs of 160,000 pixels and more: until training.coarse_until of the run",
         lambda s: s.pixels >= COARSE_PIXELS,
-        "log/2026-11-24-21-context.md",
+        "results/decisions.md",
     ),
     Rule(
         "rate_every", "rate_every", lambda c, s, steps: c.training.rate_every,
         "always: training.rate_every",
         lambda s: True,
-        "log/2026-11-25-27-sampling.md",
+        "results/decisions.md",
     ),
     Rule(
         "sampled_gradients", "sampled_gradients", lambda c, s, share: c.training.sampled_gradients,
         "on the CPU: training.sampled_gradients",
         lambda s: s.device == "cpu",
-        "log/2026-11-25-27-sampling.md",
+        "results/decisions.md",
     ),
     # Several processes must look at the same anchors, and each would know of its own views alone.
     Rule(
@@ -237,7 +237,7 @@ RULES: tuple[Rule, ...] = (
         lambda c, s, share: c.training.passed_over if c.training.sampled_gradients > 0.0 else 0.0,
         "on the CPU in one process: training.passed_over, where gradients are sampled",
         lambda s: s.device == "cpu" and s.processes == 1,
-        "log/2026-11-25-29-hidden.md",
+        "results/decisions.md",
     ),
 )  # fmt: skip
 

@@ -3,7 +3,7 @@
 Until a share of the run photographs and renderings have a half of their width and height, or a quarter, an eighth in
 equal parts of it before, as long as COARSEST_PIXELS are left: with fewer the prediction networks, and not the pixels,
 are what a step takes its time for. At 480 x 359 pixels a run takes a quarter less time for the same quality in the same
-bytes, at 960 x 717 four tenths less (docs/log/2026-11-24-21-context.md).
+bytes, at 960 x 717 four tenths less (docs/results/tried.md).
 """
 
 import math

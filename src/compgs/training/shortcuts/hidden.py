@@ -3,7 +3,7 @@
 A third of the anchors in view hardly show, and cost as much as the others until their gradients turn out to be nothing.
 Each view remembers which they were; its next steps pass them over. In every `training.rate_every`-th step, the one that
 counts the bits of all anchors in view, all are looked at again: on average at every fourth visit of a view
-(docs/log/2026-11-25-29-hidden.md). Before there is a rate, much is hidden now and seen soon: then all are looked at.
+(docs/results/tried.md). Before there is a rate, much is hidden now and seen soon: then all are looked at.
 
 What counts is not the gradient by an anchor's latents, of which a sample is left, but those by its primitives
 (`tensors/gradient_sampling.py`). Something that shows always has some: L1 pulls at every value by as much, however
