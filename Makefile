@@ -11,8 +11,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-# Kernels that were compiled once are found again by later processes.
-export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 # Idle OpenMP threads sleep instead of taking the cores from numba's.
 export OMP_WAIT_POLICY ?= PASSIVE
 
@@ -37,9 +35,11 @@ demo: venv
 	@$(BIN)/compgs demo-scene demo/scene --overwrite
 	@echo "== training and encoding"
 	@$(BIN)/compgs train demo/scene -o demo/run --preset quick --steps 2000 --overwrite
-	@$(BIN)/compgs encode demo/run -o demo.cgs --overwrite >/dev/null
+	@$(BIN)/compgs encode demo/run -o demo.cgs --overwrite --quiet
 	@echo "== demo.cgs, decoded in a new process and rendered from the held-out views"
 	@$(BIN)/compgs evaluate demo.cgs demo/scene -o demo/evaluation --overwrite
+	@echo "== what takes how many bytes"
+	@$(BIN)/compgs info demo.cgs
 	@echo "== the same file in a web page, to open from disk"
 	@$(BIN)/compgs export demo.cgs demo.html --overwrite
 

@@ -14,8 +14,8 @@ SOURCE = Path(compgs.__file__).parent
 
 # A part may import itself, and the parts named here.
 BASE = {
-    "compgs", "numerics", "errors", "extras", "gaussians", "cameras", "config", "interrupt", "notes", "outputs",
-    "presets", "words",
+    "compgs", "numerics", "errors", "extras", "gaussians", "cameras", "config", "interrupt", "notes", "occupied",
+    "outputs", "paths", "pictures", "presets", "progress", "words",
 }  # fmt: skip
 ALLOWED = {
     "compgs": {
@@ -40,6 +40,10 @@ ALLOWED = {
     "interrupt": set(),
     "notes": set(),
     "outputs": {"errors"},
+    "occupied": {"errors", "outputs"},
+    "paths": {"errors"},
+    "pictures": set(),
+    "progress": {"words"},
     "words": set(),
     "gaussians": set(),
     "cameras": set(),

@@ -127,14 +127,14 @@ def end_to_end(given: Given) -> dict[str, Any]:
 
     begun = time.perf_counter()
     with contextlib.suppress(KeyboardInterrupt):
-        compgs.train(scene, config, output=folder, device=given.device, on_progress=stop_half_way)
+        compgs.train(scene, config, output=folder, device=given.device, progress=stop_half_way)
     model = compgs.train(
         scene,
         config,
         output=folder,
         resume=True,
         device=given.device,
-        on_progress=lambda status: estimates.append(status.estimated_bytes),
+        progress=lambda status: estimates.append(status.estimated_bytes),
     )
     seconds = time.perf_counter() - begun
     path = given.out / "generated.cgs"
@@ -208,7 +208,7 @@ def large(given: Given) -> dict[str, Any]:
             raise KeyboardInterrupt
 
     with contextlib.suppress(KeyboardInterrupt):
-        compgs.train(scene, config, device=given.device, on_progress=watch, profile=profile)
+        compgs.train(scene, config, device=given.device, progress=watch, profile=profile)
     memory = torch.cuda.max_memory_allocated() / 2**20 if given.device.startswith("cuda") else 0.0
     return {
         "read_seconds": read,
@@ -242,11 +242,11 @@ def variants(given: Given) -> dict[str, Any]:
         for section, values in sections.items():
             config = replace(config, **{section: replace(getattr(config, section), **values)})
         seen: list[float] = []
-        compgs.train(scene, config, device=given.device, on_progress=lambda s, seen=seen: seen.append(s.loss))
+        compgs.train(scene, config, device=given.device, progress=lambda s, seen=seen: seen.append(s.loss))
         losses[name] = seen[-1]
     paper = replace(load_config("paper"), training=replace(load_config("paper").training, steps=steps))
     seen = []
-    compgs.train(scene, paper, device=given.device, on_progress=lambda s: seen.append(s.loss))
+    compgs.train(scene, paper, device=given.device, progress=lambda s: seen.append(s.loss))
     return {**losses, "paper": seen[-1]}
 
 

@@ -18,6 +18,10 @@ class Camera:
     width: int  # pixels
     height: int  # pixels
 
+    def __repr__(self) -> str:
+        place = ", ".join(f"{x:.4g}" for x in self.center)
+        return f"Camera({self.width} x {self.height} pixels, fx {self.fx:.5g}, at ({place}))"
+
     @property
     def rotation(self) -> np.ndarray:
         """[3, 3] world to camera."""

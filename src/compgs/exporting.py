@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from compgs import metrics
 from compgs.cameras import Camera
@@ -31,7 +31,10 @@ from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
 from compgs.notes import note
 from compgs.outputs import check_output_file, write_bytes
+from compgs.paths import as_path
+from compgs.progress import counted
 from compgs.render import RasterSettings, Renderable, render, settings_of
+from compgs.render.render_model import Trained
 from compgs.render.settings import DEFAULT_SETTINGS, as_angle
 
 if TYPE_CHECKING:
@@ -78,8 +81,9 @@ class Exported:
         return min(self.psnr)
 
 
+@counted("baking and comparing")
 def export(
-    source: str | Path,
+    source: "str | Path | Renderable | Trained",
     path: str | Path,
     *,
     degree: int | None = None,
@@ -90,9 +94,10 @@ def export(
     level: int | None = None,
     overwrite: bool = False,
     device: "Device | None" = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | Literal[False] | None = None,
 ) -> Exported:
-    """Write a scene as `.ply`, `.spz`, `.sog` or `.glb`, or as a web page (`.html`), by what the path ends in.
+    """Write a scene, or the one in a file, as `.ply`, `.spz`, `.sog` or `.glb`, or as a web page (`.html`), by what the
+    path ends in.
 
     Of a .cgs file opacity and color are baked to harmonics of `degree` over the cameras that the file holds and more
     between them. Of files of splats, harmonics above `degree` are left out. With `max_splats` or `max_bytes` those
@@ -106,7 +111,7 @@ def export(
 
     Raises ConfigError, BitstreamError, SplatFileError, OutputError, MissingDependency.
     """
-    source, path = Path(source), Path(path)
+    path = as_path(path, "path")
     limits = Limits(degree, max_splats, max_bytes)
     limits.check(refine)
     if spz_version not in spz.WRITTEN_VERSIONS:
@@ -118,19 +123,19 @@ def export(
     check_output_file(path, overwrite=overwrite)
     if kind == HTML:
         limits.check_none(path)
-        return _export_page(source, path)
+        return _export_page(as_path(source, "source"), path)
     write = functools.partial(spz.encoded, version=spz_version) if kind == "spz" else WRITERS[kind]
     chosen = chosen_device(device)
-    model = open_scene(source, chosen, level=level)
+    model = _opened(source, chosen, level)
     if isinstance(model, TiledScene):
-        tile = scene_file(source).parent / model.manifest.tiles[0].file
+        tile = scene_file(as_path(source, "source")).parent / model.manifest.tiles[0].file
         raise SplatFileError(
             f"{source}: tiles are exported one by one, as {tile}: together they may not fit in memory"
         )
     if not isinstance(model, HybridModel | SplatModel):
         raise SplatFileError(
-            f"{source}: its splats are made anew for each camera, by networks that no other format holds; it can be "
-            "rendered, compared and evaluated as it is"
+            f"{source!s:.200}: its splats are made anew for each camera, by networks that no other format holds; it "
+            "can be rendered, compared and evaluated as it is"
         )
     cameras = own_cameras(model)
     fitted = [smaller(c) for c in (*cameras, *between(cameras, max(0, FITTED_CAMERAS - len(cameras))))]
@@ -139,7 +144,7 @@ def export(
     changed = limits.change(model)
     steps = len(compared) + len(viewed) + (len(fitted) + refine if changed else 0)
     settings = as_others_draw(model, cameras)
-    count = _counter(steps, progress)
+    count = _counter(steps, progress or None)
 
     origin = (0.0, 0.0, 0.0) if kind in KEEP_WORLD_OFFSET else model.world_offset
 
@@ -361,6 +366,15 @@ def _counter(total: int, progress: Callable[[int, int], None] | None) -> Callabl
             progress(next(done), total)
 
     return count
+
+
+def _opened(source: "str | Path | Renderable | Trained", device: str, level: int | None) -> Renderable:
+    """A scene, of a file, of a training, or as it is. Raises ConfigError for what is none."""
+    if isinstance(source, Trained):
+        return source.as_hybrid_model()
+    if isinstance(source, Renderable):
+        return source
+    return open_scene(as_path(source, "source"), device, level=level)
 
 
 def _export_page(source: Path, path: Path) -> Exported:

@@ -17,6 +17,9 @@ class Gaussians(Generic[Array]):
     opacities: Array  # [M] in [0, 1]
     colors: Array  # [M, 3] display RGB, 0 to 1 (not clamped)
 
+    def __repr__(self) -> str:
+        return f"Gaussians({len(self):,})"
+
     def __len__(self) -> int:
         means: Any = self.means
         return len(means)

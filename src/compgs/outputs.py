@@ -13,6 +13,8 @@ from typing import Any
 
 from compgs.errors import OutputError
 
+LOCK_NAME = ".lock"  # in a folder that a process is writing (`occupied.py`), or that one was writing when it was killed
+
 
 def check_output_file(path: Path, *, overwrite: bool = False, needed_bytes: int = 1 << 20) -> None:
     """Raises OutputError if `path` exists (unless `overwrite`) or could not be written."""
@@ -106,10 +108,14 @@ def _numbered(path: Path) -> bool:
 
 
 def write_json(path: Path, content: dict[str, Any] | list[Any]) -> None:
-    """JSON for programs, indented for people. JSON has no infinity and no not-a-number: those become null."""
-    text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
+    """JSON for programs, indented for people."""
     # Names of files need not be text: what is not becomes an escape of JSON, from which it can be read back.
-    write_bytes(path, (text + "\n").encode("utf-8", "backslashreplace"))
+    write_bytes(path, (json_text(content) + "\n").encode("utf-8", "backslashreplace"))
+
+
+def json_text(content: dict[str, Any] | list[Any]) -> str:
+    """JSON, indented. It has no infinity and no not-a-number: those become null."""
+    return json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:
@@ -122,7 +128,7 @@ def _finite(value: Any) -> Any:
 
 def _holds_something(folder: Path) -> bool:
     try:
-        return any(folder.iterdir())
+        return any(path.name != LOCK_NAME for path in folder.iterdir())
     except OSError as error:
         raise OutputError(f"{folder}: cannot be read ({error.strerror})") from error
 

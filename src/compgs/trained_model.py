@@ -159,6 +159,9 @@ class TrainedModel(nn.Module):
         # [N, K * residual_dim] steps, or [1, K * residual_dim] where all anchors share them
         self.residuals = nn.Parameter(self.residual_kind.start(self.entropy.starting_residuals(), n))
 
+    def __repr__(self) -> str:
+        return f"TrainedModel({self.anchors:,} anchors, {int(self.mask.sum()):,} coupled primitives)"
+
     @property
     def anchors(self) -> int:
         return len(self.coordinates)

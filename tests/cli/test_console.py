@@ -33,6 +33,7 @@ class Status:
     estimated_bytes: int = 181_000
     seconds_per_step: float = 0.08
     lmbda: float = 0.001
+    seconds_left: float | None = None
 
 
 def test_a_status_says_what_matters_most_first() -> None:

@@ -130,3 +130,37 @@ def test_without_ffmpeg_a_video_is_refused_before_anything_is_read(
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert rendered(tiny_cgs, tmp_path / "nowhere", "-o", tmp_path / "out.mp4") == 1
     assert "pip install '.[video]' in the project's folder" in capsys.readouterr().err
+
+
+def test_an_animation_has_the_frames_of_the_way_and_their_pace(tiny_cgs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "tour.gif"
+    assert rendered(tiny_cgs, "--frames", 4, *SIZE, "--fps", 10, "-o", out) == 0
+    assert rendered(tiny_cgs, "--frames", 4, *SIZE, "-o", tmp_path / "images") == 0
+    with Image.open(out) as animation:
+        assert (animation.format, animation.n_frames, animation.size) == ("GIF", 4, (48, 32))
+        assert animation.info["duration"] == 100 and animation.info["loop"] == 0
+        for i in range(4):
+            animation.seek(i)
+            image = np.asarray(Image.open(tmp_path / "images" / f"{i:05d}.png"))
+            assert psnr(np.asarray(animation.convert("RGB")), image) > 25
+
+
+@pytest.mark.parametrize("name", ["out.webm", "out.PNG", "out.mov"])
+def test_files_that_are_not_written_are_refused(
+    tiny_cgs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    assert rendered(tiny_cgs, "-o", tmp_path / name) == 2
+    assert "a folder for PNG images, or a name that ends in .mp4 or .gif" in capsys.readouterr().err
+    assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "size"),
+    [((), (640, 480)), (("--width", 100), (100, 76)), (("--height", 60), (80, 60)), (SIZE, (48, 32))],
+)
+def test_images_of_a_way_have_the_shape_of_the_captures_pictures(
+    tiny_cgs: Path, tmp_path: Path, options: tuple[object, ...], size: tuple[int, int]
+) -> None:
+    """Those of the file are 64 x 48."""
+    assert rendered(tiny_cgs, "--frames", 1, *options, "-o", tmp_path / "out") == 0
+    assert Image.open(tmp_path / "out" / "00000.png").size == size

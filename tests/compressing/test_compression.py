@@ -110,7 +110,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_file(
 
     output = tmp_path / "stopped.cgs"
     with pytest.raises(KeyboardInterrupt):
-        compress(ball_ply, output, config=config, looking=LOOKING, on_progress=stop)
+        compress(ball_ply, output, config=config, looking=LOOKING, progress=stop)
     assert not output.exists()
     going = resumed(output)
     assert going.goes_on

@@ -154,7 +154,7 @@ def check_continues(blob_scene: Any, tmp_path: Path) -> Any:
                 if status.step == stop:
                     raise KeyboardInterrupt
 
-            options = {"output": tmp_path / name, "resume": resume, "on_progress": look, "splats": splats}
+            options = {"output": tmp_path / name, "resume": resume, "progress": look, "splats": splats}
             model = methods.train(blob_scene, config, method=method, device="cpu", **options)
             path = tmp_path / f"{name}.packed"
             methods.write(model, path, method=method, config=config)

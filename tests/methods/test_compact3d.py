@@ -210,5 +210,5 @@ def test_damaged_content_is_refused(trainer: SplatTrainer, tmp_path: Path) -> No
 
 def test_a_training_on_the_way_tells_its_size(blob_scene: Scene) -> None:
     seen: list[int] = []
-    trained(blob_scene, settings(), on_progress=lambda status: seen.append(status.estimated_bytes))
+    trained(blob_scene, settings(), progress=lambda status: seen.append(status.estimated_bytes))
     assert min(seen) > 0 and max(seen) < 60 * 20 * len(blob_scene.points)

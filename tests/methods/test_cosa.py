@@ -277,7 +277,7 @@ def test_a_run_that_was_stopped_in_either_phase_gives_the_same_file(
 
     run, again = tmp_path / "run", tmp_path / "b.packed"
     with pytest.raises(KeyboardInterrupt):
-        train(blob_scene, settings(), method="cosa-gs", device="cpu", output=run, on_progress=stopped)
+        train(blob_scene, settings(), method="cosa-gs", device="cpu", output=run, progress=stopped)
     for _ in range(2):  # a finished run gives the same once more
         model = train(blob_scene, settings(), method="cosa-gs", device="cpu", output=run, resume=True)
         write(model, again, method="cosa-gs")

@@ -226,7 +226,7 @@ def test_more_pruning_leaves_fewer_splats_and_a_smaller_file(
 def test_the_size_is_known_while_training(blob_scene: Scene, tmp_path: Path) -> None:
     seen: list[Any] = []
     config = quick("eagles")
-    model = train(blob_scene, config, method="eagles", device="cpu", on_progress=seen.append)
+    model = train(blob_scene, config, method="eagles", device="cpu", progress=seen.append)
     written = write(model, tmp_path / "a", method="eagles", config=config)
     made, _ = trainer(blob_scene)
     assert made.estimated_bytes() >= 36 * 150

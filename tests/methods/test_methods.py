@@ -78,7 +78,7 @@ def test_a_method_with_hooks_phases_and_a_container_shows_what_it_trained(
     blob_scene: Scene, tmp_path: Path
 ) -> None:
     seen = []
-    result = train(blob_scene, quick("toy"), method="toy", device="cpu", on_progress=seen.append)
+    result = train(blob_scene, quick("toy"), method="toy", device="cpu", progress=seen.append)
     model, colors = result
     assert len(model.splats) == len(colors.labels) != len(blob_scene.points)
     assert [(s.step, s.steps) for s in seen] == [(10 * i, 60) for i in range(1, 7)]
@@ -102,7 +102,7 @@ def test_a_run_with_hooks_that_was_stopped_in_any_phase_continues_exactly(
 
     whole, path = train(blob_scene, quick("toy"), method="toy", device="cpu"), tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        train(blob_scene, quick("toy"), method="toy", device="cpu", output=path, on_progress=stopped)
+        train(blob_scene, quick("toy"), method="toy", device="cpu", output=path, progress=stopped)
     again = train(blob_scene, quick("toy"), method="toy", device="cpu", output=path, resume=True)
     write(whole, tmp_path / "a", method="toy")
     write(again, tmp_path / "b", method="toy")

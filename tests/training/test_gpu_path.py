@@ -100,7 +100,7 @@ def test_a_run_on_the_gpus_path_goes_on_as_if_it_had_not_stopped(gpu_path, blob_
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):  # after ten steps, the first report
-        train(blob_scene, config, output=tmp_path / "run", device="cpu", on_progress=stop)
+        train(blob_scene, config, output=tmp_path / "run", device="cpu", progress=stop)
     resumed = train(blob_scene, config, output=tmp_path / "run", resume=True, device="cpu")
     assert torch.equal(resumed.references, whole.references)
 
@@ -110,7 +110,7 @@ def test_a_run_on_the_gpus_path_goes_on_as_if_it_had_not_stopped(gpu_path, blob_
 )
 def test_each_option_takes_its_steps_on_the_gpus_path(gpu_path, blob_scene, tiny_config, change):
     losses = []
-    train(blob_scene, small(tiny_config, **change), device="cpu", on_progress=lambda s: losses.append(s.loss))
+    train(blob_scene, small(tiny_config, **change), device="cpu", progress=lambda s: losses.append(s.loss))
     assert losses and np.isfinite(losses).all() and gpu_path.drawings >= 10
 
 
@@ -119,7 +119,7 @@ def test_the_gpus_path_learns_as_the_kernels_do(blob_scene, tiny_config, gpu_pat
     losses = []
     for _ in range(2):  # first by torch, then by kernels
         seen: list[float] = []
-        train(blob_scene, config, device="cpu", on_progress=lambda s, seen=seen: seen.append(s.loss))
+        train(blob_scene, config, device="cpu", progress=lambda s, seen=seen: seen.append(s.loss))
         losses.append(seen)
         monkeypatch.undo()
     assert losses[0] == pytest.approx(losses[1], rel=0.02)

@@ -77,7 +77,7 @@ def test_an_interrupt_leaves_a_checkpoint_of_the_last_whole_step(blob_scene, con
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_splats(blob_scene, config, output=tmp_path, on_progress=stop)
+        train_splats(blob_scene, config, output=tmp_path, progress=stop)
     continued = train_splats(blob_scene, config, output=tmp_path, resume=True)
     assert file_of(continued) == file_of(train_splats(blob_scene, config))
 

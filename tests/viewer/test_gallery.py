@@ -1,13 +1,20 @@
 """The gallery's server: its list, whole files and parts of them, and nothing from outside of the folder."""
 
+import html
 import http.client
+import io
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
+import compgs
+from compgs.metrics import psnr, to_8bit
 from compgs.viewer.gallery import byte_range, gallery_page, gallery_server
+from compgs.viewer.thumbnails import Thumbnails
 
 DATA = bytes(range(256)) * 8
 
@@ -42,15 +49,56 @@ def ask(
     return answer.status, dict(answer.getheaders()), answer.read()
 
 
-def test_the_list_links_every_file_and_nothing_else(folder: Path) -> None:
-    page = gallery_page(folder.resolve()).decode()
+GOLDEN = Path(__file__).parent.parent / "golden" / "trained.cgs"
+
+
+def test_the_list_links_every_whole_file_and_nothing_else(folder: Path) -> None:
+    (folder / "inner" / "a b&<i>.cgs").write_bytes(GOLDEN.read_bytes())
+    page = gallery_page(folder.resolve(), Thumbnails()).decode()
     assert page.count("<li>") == 1
-    assert "inner/a b&amp;&lt;i&gt;" in page and "2 kB" in page
+    assert "inner/a b&amp;&lt;i&gt;" in page and "6.18 kB" in page
     assert 'href="/view?url=%2Ffiles%2Finner%2Fa%2520b%2526%253Ci%253E.cgs"' in page
 
 
-def test_an_empty_folder_says_so(tmp_path: Path) -> None:
-    assert b"There is no .cgs file" in gallery_page(tmp_path)
+def test_a_file_that_is_not_whole_is_marked_says_why_and_has_no_link(folder: Path) -> None:
+    (folder / "cut.cgs").write_bytes(GOLDEN.read_bytes()[:300])
+    page = gallery_page(folder.resolve(), Thumbnails()).decode()
+    assert page.count("<li>") == page.count('class="card broken"') == 2
+    assert "header promises" in page and "href=" not in page.partition("<h1>")[2]
+    (folder / "cut.cgs").write_bytes(GOLDEN.read_bytes())  # copied again
+    assert "href=" in gallery_page(folder.resolve(), Thumbnails()).decode().partition("<h1>")[2]
+
+
+def test_thumbnails_show_what_the_file_shows_from_its_first_viewpoint(
+    address: tuple[str, int], folder: Path
+) -> None:
+    (folder / "scene.cgs").write_bytes(GOLDEN.read_bytes())
+    status, headers, body = ask(address, "/thumbnails/scene.cgs?1")
+    assert status == 200 and headers["Content-Type"] == "image/jpeg"
+    picture = np.asarray(Image.open(io.BytesIO(body)))
+    assert picture.shape == (240, 320, 3)
+    model = compgs.decode(GOLDEN)
+    expected = compgs.render(model, model.viewpoints[0].resized(320, 240)).image
+    assert psnr(picture, to_8bit(expected)) > 30
+
+
+def test_thumbnails_of_what_is_no_scene_or_outside_are_not_found(address: tuple[str, int]) -> None:
+    for path in ("inner/a%20b%26%3Ci%3E.cgs", "link.cgs", "notes.txt", "../outside.cgs", "nothing.cgs", ""):
+        assert ask(address, f"/thumbnails/{path}")[0] == 404
+
+
+def test_a_scenes_page_has_its_name_and_a_way_back(address: tuple[str, int]) -> None:
+    body = ask(address, "/view?url=%2Ffiles%2Finner%2Fa%2520%253Cb%253E.cgs")[2].decode()
+    assert "<title>inner/a &lt;b&gt;</title>" in body
+    assert body.count("</body>") == 1 and '<a href="/"' in body.rpartition("</script>")[2]
+
+
+def test_an_empty_folder_says_how_a_file_gets_there(tmp_path: Path) -> None:
+    page = gallery_page(tmp_path, Thumbnails()).decode()
+    assert "There is no .cgs file" in page and "compgs train SCENE -o " in page
+    (tmp_path / "my splats.ply").write_bytes(b"")
+    page = html.unescape(gallery_page(tmp_path, Thumbnails()).decode())
+    assert f"compgs compress '{tmp_path}/my splats.ply' -o '{tmp_path}/my splats.cgs'" in page
 
 
 def test_list_and_viewer_are_pages(address: tuple[str, int]) -> None:

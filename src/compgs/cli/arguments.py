@@ -8,6 +8,8 @@ ourselves at what is missing (`options.py`).
 import contextlib
 import difflib
 import io
+import shlex
+import sys
 import types
 import typing
 from collections.abc import Sequence
@@ -37,12 +39,13 @@ def parse_command(commands: Sequence[type[Command]], words: Sequence[str]) -> Co
     names = [command_name(command) for command in commands]
     if words[0] not in names:
         raise UsageError(
-            f"{words[0]}: there is no such command{_meant(words[0], names)}; there are {', '.join(names)}"
+            f"{words[0]}: there is no such command{_meant_command(words, names)}; there are {', '.join(names)}"
         )
     kind = commands[names.index(words[0])]
     options = options_of(kind)
+    shown = _Shown(sys.stdout)
     try:
-        with contextlib.redirect_stderr(io.StringIO()), _values():
+        with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(shown), _values():
             form: Any = typing.Annotated[kind, tyro.conf.configure(tyro.conf.OmitArgPrefixes)]
             command, unknown = tyro.cli(
                 form,
@@ -52,6 +55,8 @@ def parse_command(commands: Sequence[type[Command]], words: Sequence[str]) -> Co
             )
     except SystemExit as stop:
         if not stop.code:
+            _, empty_line, explanation = shown.getvalue().partition("\n\n")
+            sys.stdout.write(usage_of(words[0], kind.asked_for, options) + empty_line + explanation)
             raise
         raise UsageError(f"{misfit(options, words[1:])}\n{_help_line(words[0])}") from None
     if unknown:
@@ -67,6 +72,31 @@ def parse_command(commands: Sequence[type[Command]], words: Sequence[str]) -> Co
 def command_name(command: type[Command]) -> str:
     """`DemoScene` is `demo-scene`."""
     return "".join(f"-{c.lower()}" if c.isupper() else c for c in command.__name__).lstrip("-")
+
+
+def usage_of(name: str, asked_for: Sequence[str], options: Sequence[Option]) -> str:
+    """`usage: compgs train SCENE -o RUN [OPTIONS]`: brackets are around what may be left out. `asked_for`: fields that
+    may not, although the parser does without them.
+    """
+    needed = [option for option in options if option.required or option.field in asked_for]
+    places = [
+        option.placeholder if option in needed else f"[{option.placeholder}]"
+        for option in sorted(options, key=lambda option: option not in needed)
+        if not option.flags
+    ]
+    flags = [f"{min(option.flags, key=len)} {option.placeholder}" for option in needed if option.flags]
+    return " ".join(["usage: compgs", name, *places, *flags, "[OPTIONS]"])
+
+
+class _Shown(io.StringIO):
+    """What the parser shows, before it is shown: as wide and colored as it would be on `stream`."""
+
+    def __init__(self, stream: typing.TextIO) -> None:
+        super().__init__()
+        self.stream = stream
+
+    def isatty(self) -> bool:
+        return self.stream.isatty()
 
 
 def _check_values(command: Command, options: Sequence[Option], words: Sequence[str]) -> None:
@@ -123,6 +153,13 @@ def _without_none(kind: Any) -> Any:
 def _meant(word: str, known: Sequence[str]) -> str:
     close = difflib.get_close_matches(word, known, n=1)
     return f" (did you mean {close[0]}?)" if close else ""
+
+
+def _meant_command(words: Sequence[str], names: Sequence[str]) -> str:
+    """Also where the command comes after what it is to be done with."""
+    if len(words) > 1 and words[1] in names:
+        return f" (did you mean compgs {shlex.join([words[1], words[0], *words[2:]])}?)"
+    return _meant(words[0], names)
 
 
 def _help_line(name: str) -> str:

@@ -4,7 +4,7 @@ import dataclasses
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
@@ -28,8 +28,35 @@ class Command:
     debug: FlagCreatePairsOff[bool] = False
     """Show where in the program an error came from."""
 
+    quiet: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-q"])] = False
+    """Say nothing but warnings and errors."""
+
+    # Arguments that are asked for, although the parser does without them: the usage line shows them as such.
+    asked_for: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def prints_results_alone(self) -> bool:
+        """Whether standard output is for a program that reads it."""
+        return False
+
+    def check_machine(self) -> None:
+        """Check, before anything is read, that this machine has what is asked for. Raises ConfigError, UsageError."""
+
     def run(self) -> None:
         raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class JsonOption:
+    """Results for programs."""
+
+    json: FlagCreatePairsOff[bool] = False
+    """Print the results as JSON, and everything else on standard error."""
+
+    @property
+    def prints_results_alone(self) -> bool:
+        """Whether standard output is for a program that reads it."""
+        return self.json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,11 +70,14 @@ class ComputingCommand(Command):
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint=NO_DEFAULT)] = None
     """Where to compute; a CUDA GPU by default where there is one."""
 
-    def prepare(self, *stages: str) -> None:
-        """Apply `threads`, check `device`; let helpers compile what some stages of work need, where nothing has been
-        compiled yet. Raises UsageError, ConfigError."""
+    def check_machine(self) -> None:
+        """Check, before anything is read, that `device` is there. Raises ConfigError, UsageError."""
         if self.device is not None:
             check_device(self.device)
+
+    def prepare(self, *stages: str) -> None:
+        """Apply `threads`; let helpers compile what some stages of work need, where nothing has been
+        compiled yet. Raises UsageError."""
         self.start_helpers(*stages)
         if self.threads is not None:
             use_threads(self.threads)
@@ -86,7 +116,7 @@ class DecodingCommand(ComputingCommand):
     """Let the program tmc3 from PATH decode anchor positions that a file has by G-PCC."""
 
     def prepare(self, *stages: str) -> None:
-        """Apply `threads` and `tmc3`, check `device`; start helpers. Raises UsageError, ConfigError."""
+        """Apply `threads` and `tmc3`; start helpers. Raises UsageError."""
         super().prepare(*stages)
         if self.tmc3:
             allow_tmc3()

@@ -9,14 +9,16 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from compgs.cli.command import (
     NO_DEFAULT,
     ComputingCommand,
+    JsonOption,
     MemoryOption,
     ReadingOptions,
     check_measures,
 )
-from compgs.cli.console import print_comparison, say
+from compgs.cli.console import print_comparison, print_json, say
 from compgs.cli.progress import counting
 from compgs.cli.scenes import read_scene
 from compgs.cli.usage import UsageError
+from compgs.occupied import occupied_if_given
 from compgs.outputs import check_output_folder
 
 if TYPE_CHECKING:
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(ComputingCommand, ReadingOptions, MemoryOption):
+class Compare(JsonOption, ComputingCommand, ReadingOptions, MemoryOption):
     """Compare two files of one scene, of any format: bytes, primitives, and what both look like from the same cameras.
 
     With --scene both are compared with the held-out photographs, too; give -r and the like as in training. Without,
@@ -86,7 +88,7 @@ class Compare(ComputingCommand, ReadingOptions, MemoryOption):
         from compgs.evaluation.comparison import PAGE_NAME
 
         scene = self.read_scene()
-        with counting("comparing views") as progress:
+        with occupied_if_given(self.output), counting("comparing views") as progress:
             found = compare(
                 self.a,
                 self.b,
@@ -99,7 +101,10 @@ class Compare(ComputingCommand, ReadingOptions, MemoryOption):
                 device=self.device,
                 progress=progress,
             )
-        print_comparison(found)
+        if self.json:
+            print_json({**found.to_dict(), "per_view": found.per_view_list()})
+        else:
+            print_comparison(found)
         if self.output is not None:
             say("")
             say(f"pictures with a line to move between them: {self.output / PAGE_NAME}")

@@ -10,11 +10,12 @@ from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from compgs.cli.command import NO_DEFAULT, ComputingCommand
-from compgs.cli.console import console, say
+from compgs.cli.console import console, say, warn
 from compgs.cli.progress import counting, training
 from compgs.cli.settings import assigned, with_settings
 from compgs.cli.sizes import parse_size, parse_time
 from compgs.cli.usage import UsageError, settings_of_options
+from compgs.occupied import occupied
 from compgs.words import duration, size
 
 if TYPE_CHECKING:
@@ -43,6 +44,8 @@ class Compress(ComputingCommand):
     compgs compress -o scene.cgs --resume
     """
 
+    asked_for = ("file", "output")
+
     file: Annotated[Positional[Path | None], arg(metavar="FILE", help_behavior_hint=NO_DEFAULT)] = None
     """Splats: .ply (also SuperSplat's .compressed.ply), .spz, .sog (or its meta.json or lod-meta.json), .glb, .gltf,
     .ksplat, .splat."""
@@ -64,7 +67,8 @@ class Compress(ComputingCommand):
 
     time: Annotated[str | None, arg(metavar="TIME", help_behavior_hint=NO_DEFAULT)] = None
     """How long it may take until the file is written, about: 5min, 90s, 1h30min. The steps are chosen for it before the
-    training begins; as the machine's speed decides, --seed alone no longer gives the same file."""
+    training begins, and some are left out if the machine becomes slower; as its speed decides, --seed alone no longer
+    gives the same file."""
 
     steps: Annotated[
         int | None, arg(aliases=["--iterations"], metavar="N", help_behavior_hint="(default: the preset's)")
@@ -106,15 +110,23 @@ class Compress(ComputingCommand):
                 "no file to write was given: name it with -o, as in `compgs compress FILE -o OUT.cgs`"
             )
         self.check_resume()
+        from compgs.compressing import check_places, folder_of
+
+        check_places(self.output, overwrite=self.overwrite or self.resume)
+        with occupied(folder_of(self.output)):
+            self.compress(self.output)
+
+    def compress(self, output: Path) -> None:
+        """Everything, in the run's folder, which is this process's until the end."""
         start = time.perf_counter()
-        compression = self.continued(self.output) if self.resume else self.begun(self.output)
+        compression = self.continued(output) if self.resume else self.begun(output)
         say_what(compression)
         try:
             with training() as show:
                 written = compression.train(show)
         except KeyboardInterrupt as stop:
-            raise type(stop)(interrupted(self.output)) from None
-        say(f"{self.output}: {size(written)}, {duration(time.perf_counter() - start)} after the beginning")
+            raise type(stop)(interrupted(output)) from None
+        say(f"{output}: {size(written)}, {duration(time.perf_counter() - start)} after the beginning")
         with counting("comparing") as progress:
             compressed = compression.judge(progress)
         say("")
@@ -198,6 +210,8 @@ class Compress(ComputingCommand):
 
 def say_what(compression: "Compression") -> None:
     """What is about to happen."""
+    from compgs.compressing.deadline import ENOUGH
+
     scene, begun = compression.scene, compression.begun
     camera = scene.train_views[0].camera
     say(
@@ -207,6 +221,8 @@ def say_what(compression: "Compression") -> None:
     )
     for line in compression.plan.in_words():
         say(line)
+    if begun.config.training.steps < ENOUGH and compression.deadline is not None:
+        warn(f"so little time gives a rough file: {ENOUGH:,} steps or more are wanted")
     if compression.goes_on:
         say("goes on from the last checkpoint")
 

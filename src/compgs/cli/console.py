@@ -3,13 +3,14 @@
 import io
 import sys
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from compgs.cli.usage import in_words_of_options
+from compgs.outputs import json_text
 from compgs.words import duration, size
 
 if TYPE_CHECKING:
@@ -33,6 +34,19 @@ def show_whatever_can_be_shown() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
+def speak(*, quiet: bool = False, results_alone: bool = False) -> None:
+    """How loud what follows is: `quiet`, warnings and errors alone are said; with `results_alone` standard output is
+    for results (`print_json`), and what is said goes to standard error.
+    """
+    console.quiet = quiet
+    console.stderr = results_alone
+
+
+def print_json(results: "dict[str, Any]") -> None:
+    """Results for a program, on standard output."""
+    print(json_text(results))
+
+
 def say(message: str) -> None:
     """One line for a person, markup taken literally."""
     console.print(escape(message))
@@ -45,7 +59,7 @@ def warn(message: str) -> None:
 
 def print_components(components: Mapping[str, int], anchors: int, coupled: int) -> None:
     """Bytes and bits by component of a .cgs file."""
-    _print_shares(components, {"bits/anchor": anchors, "bits/coupled": coupled})
+    print_shares(components, {"bits/anchor": anchors, "bits/coupled": coupled})
 
 
 def print_ranges(ranges: "Sequence[RangeInfo]") -> None:
@@ -69,7 +83,7 @@ def print_tiles(tiles: "Sequence[TileEntry]") -> None:
     console.print(table)
 
 
-def _print_shares(components: Mapping[str, int], counts: Mapping[str, int]) -> None:
+def print_shares(components: Mapping[str, int], counts: Mapping[str, int]) -> None:
     """A table of bytes by component; each of the `counts` gets a column: bits per one of them."""
     total = sum(components.values())
     table = Table(box=None, pad_edge=False)
@@ -96,6 +110,29 @@ def print_profile(milliseconds: Mapping[str, float]) -> None:
     console.print(table)
 
 
+def quality_of(results: "Results") -> str:
+    """`PSNR 26.10 dB, SSIM 0.8810 on 5 held-out views of 320 x 240 pixels`, with the measures that were asked for."""
+    measures = [f"PSNR {results.psnr:.2f} dB", f"SSIM {results.ssim:.4f}"]
+    measures += (
+        []
+        if results.lpips is None
+        else [f"LPIPS {results.lpips:.4f} ({results.lpips_3dgs:.4f} as 3DGS has it)"]
+    )
+    measures += [] if results.flip is None else [f"FLIP {results.flip:.4f}"]
+    views = f"{len(results.per_view)} held-out views of {results.width} x {results.height} pixels"
+    return f"{', '.join(measures)} on {views}"
+
+
+def say_remarks(results: "Results") -> None:
+    """What is to be known beside the figures of an evaluation, if anything."""
+    for note in results.notes:
+        warn(in_words_of_options(note))
+    if results.lpips is None and results.lpips_note != "not asked for":
+        say(f"LPIPS: {results.lpips_note}")
+    if results.exposure is not None:
+        say(results.exposure)
+
+
 def print_results(results: "Results") -> None:
     """The short table of an evaluation."""
     table = Table(box=None, pad_edge=False, show_header=False)
@@ -106,8 +143,6 @@ def print_results(results: "Results") -> None:
     if results.lpips is not None:
         table.add_row("LPIPS", f"{results.lpips:.4f}")
         table.add_row("LPIPS as 3DGS measures it", f"{results.lpips_3dgs:.4f}")
-    elif results.lpips_note != "not asked for":
-        table.add_row("LPIPS", escape(str(results.lpips_note)))
     if results.flip is not None:
         table.add_row("FLIP", f"{results.flip:.4f}")
     table.add_row("file", f"{results.bytes:,} bytes")
@@ -122,19 +157,9 @@ def print_results(results: "Results") -> None:
     if results.degrees_to_training is not None:
         table.add_row("to the nearest training view", f"{results.degrees_to_training:.1f}°")
     views = f"{len(results.per_view)} held-out views, {results.width} x {results.height}"
-    for note in results.notes:
-        warn(in_words_of_options(note))
     say(f"{results.file} on {results.scene}: {views}, {results.device}, {results.threads} threads")
     console.print(table)
-    if results.exposure is not None:
-        say(results.exposure)
-    console.print()
-    counts = {
-        "bits/anchor": results.anchors,
-        "bits/coupled": results.coupled_primitives,
-        "bits/splat": results.splats,
-    }
-    _print_shares(results.components, {name: n for name, n in counts.items() if n is not None})
+    say_remarks(results)
 
 
 def print_errors(errors: "ErrorAccount") -> None:

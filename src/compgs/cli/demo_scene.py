@@ -14,7 +14,8 @@ from compgs.cli.console import say
 from compgs.cli.progress import counting
 from compgs.cli.usage import check_range
 from compgs.errors import OutputError
-from compgs.outputs import check_output_folder
+from compgs.occupied import occupied
+from compgs.outputs import LOCK_NAME, check_output_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,11 +55,10 @@ class DemoScene(Command):
             check_only_a_scene(self.folder)
         from compgs.scene.generated import generate_scene
 
-        # An earlier scene stays until the new one is complete.
-        earlier = self.folder.is_dir() and any(self.folder.iterdir())
+        # What is in the folder stays until the new scene is complete.
         hidden = self.folder.absolute().with_name(f".{self.folder.absolute().name}.{secrets.token_hex(8)}")
-        target = hidden.with_suffix(".new") if earlier else self.folder
-        with counting("ray tracing") as progress:
+        target = hidden.with_suffix(".new")
+        with occupied(self.folder), counting("ray tracing") as progress:
             generate_scene(
                 target,
                 views=self.views,
@@ -67,7 +67,6 @@ class DemoScene(Command):
                 seed=self.seed,
                 progress=progress,
             )
-        if earlier:
             self.folder.rename(hidden)
             target.rename(self.folder)
             shutil.rmtree(hidden)
@@ -76,7 +75,7 @@ class DemoScene(Command):
 
 def check_only_a_scene(folder: Path) -> None:
     """Raises OutputError if a folder that is to be replaced holds anything else than a generated scene."""
-    parts = [path for path in folder.glob("*") if path.name in ("images", "sparse")]
+    parts = [path for path in folder.glob("*") if path.name in ("images", "sparse", LOCK_NAME)]
     others = [path for path in folder.glob("*") if path not in parts]
     others += [path for path in (folder / "images").glob("*") if not fnmatch(path.name, "view_*.png")]
     if others:

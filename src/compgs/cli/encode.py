@@ -1,5 +1,6 @@
 """`compgs encode`: the file of a finished run, or a smaller one from a file."""
 
+import shlex
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.command import DecodingCommand, ReadingOptions, allow_tmc3
-from compgs.cli.console import print_components, print_reduction, say
+from compgs.cli.console import print_reduction, say
 from compgs.cli.inputs import check_bitstream, read_bitstream
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import CHECKPOINT_NAME, SETTINGS_NAME, SceneSource, file_name, load_settings
@@ -89,11 +90,8 @@ class Encode(DecodingCommand, ReadingOptions):
         if self.source.is_file() and self.cameras is not None:
             data = with_fewer_viewpoints(data, parse_cameras(self.cameras))
         write_bytes(path, data)
-        from compgs.codec.reader import file_info
-
-        info = file_info(data)
         say(f"{path}: {size(len(data))}, written after {duration(time.perf_counter() - start)}")
-        print_components({s.name: s.bytes for s in info.sections}, info.anchors, info.coupled)
+        say(f"what takes how many bytes: compgs info {shlex.quote(str(path))}")
 
     @property
     def reduces(self) -> bool:

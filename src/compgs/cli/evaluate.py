@@ -9,20 +9,22 @@ from tyro.conf import FlagCreatePairsOff, arg
 from compgs.cli.command import (
     NO_DEFAULT,
     DecodingCommand,
+    JsonOption,
     MemoryOption,
     SceneFileOrRunArgument,
     SceneOptions,
     check_measures,
 )
-from compgs.cli.console import print_errors, print_results, say, warn
+from compgs.cli.console import print_errors, print_json, print_results, say, warn
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import file_and_run, read_otherwise
 from compgs.cli.scenes import read_scene
+from compgs.occupied import occupied_if_given
 from compgs.outputs import check_output_folder
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption):
+class Evaluate(JsonOption, DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOption):
     """Decode a file, render a scene's held-out views from it and compare them with the photographs.
 
     Give -r, --images, --test-every and --background as in training: the views held out there are the ones to
@@ -83,7 +85,7 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
         from compgs.evaluation import evaluate
 
         scene = read_scene(source)
-        with counting("evaluating views") as progress:
+        with occupied_if_given(self.output), counting("evaluating views") as progress:
             results = evaluate(
                 file,
                 scene,
@@ -97,11 +99,14 @@ class Evaluate(DecodingCommand, SceneOptions, SceneFileOrRunArgument, MemoryOpti
                 exposure=self.exposure or (run is not None and run.config.training.exposure),
                 progress=progress,
             )
-        say("")
-        print_results(results)
-        if results.errors is not None:
+        if self.json:
+            print_json({**results.to_dict(), "per_view": results.per_view_list()})
+        else:
             say("")
-            print_errors(results.errors)
+            print_results(results)
+            if results.errors is not None:
+                say("")
+                print_errors(results.errors)
         if self.output is not None:
             say("")
             say(f"renders beside photographs: {self.output / 'contact_sheet.png'}")

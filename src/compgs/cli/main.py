@@ -4,7 +4,6 @@ Exit codes: 0 done; 1 something is wrong with the input, the output or the file;
 understood, or has a value that is out of range; 130 stopped by the user (Ctrl-C), 143 by the system (SIGTERM).
 """
 
-import os
 import sys
 from collections.abc import Sequence
 
@@ -18,7 +17,7 @@ from compgs.cli.command import Command
 from compgs.cli.compare import Compare
 from compgs.cli.compiling import say_when_compiling
 from compgs.cli.compress import Compress
-from compgs.cli.console import console, errors, show_whatever_can_be_shown
+from compgs.cli.console import console, errors, show_whatever_can_be_shown, speak
 from compgs.cli.decode import Decode
 from compgs.cli.demo_scene import DemoScene
 from compgs.cli.encode import Encode
@@ -30,10 +29,12 @@ from compgs.cli.reconstruct import Reconstruct
 from compgs.cli.render import Render
 from compgs.cli.report import Report
 from compgs.cli.serve import Serve
+from compgs.cli.streams import give_up_stdout, open_closed_streams
+from compgs.cli.swapped import exchanged
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError, in_words_of_options
 from compgs.cli.view import View
-from compgs.errors import CompGSError
+from compgs.errors import CompGSError, OutputError
 from compgs.interrupt import Terminated, ended_on_request, held_back
 
 COMMANDS: tuple[type[Command], ...] = (
@@ -79,20 +80,24 @@ def parse(words: Sequence[str]) -> Command:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code."""
+    open_closed_streams()
     try:
         code = dispatched(arguments)
         sys.stdout.flush()
         return code
     except BrokenPipeError:
-        # Python writes what is left when it ends, which would fail again, with a traceback.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        give_up_stdout()
         return 1
+    except OSError as error:
+        give_up_stdout()
+        return fail(OutputError(f"standard output: cannot be written ({error.strerror or error})"))
 
 
 def dispatched(arguments: Sequence[str] | None = None) -> int:
-    """The exit code. Raises BrokenPipeError when nobody reads on."""
+    """The exit code. Raises BrokenPipeError when nobody reads on, OSError where standard output cannot be written."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     show_whatever_can_be_shown()
+    speak()
     if given in (["--version"], ["-V"]):
         print(f"compgs {__version__}")
         return 0
@@ -105,21 +110,23 @@ def dispatched(arguments: Sequence[str] | None = None) -> int:
         return 0
     except UsageError as error:
         return fail(error)
-    return run(command)
+    return run(command, given)
 
 
-def run(command: Command) -> int:
+def run(command: Command, words: Sequence[str]) -> int:
     """The exit code; unexpected exceptions, which are our mistakes, keep their traceback."""
+    speak(quiet=command.quiet, results_alone=command.prints_results_alone)
     say_when_compiling()
     try:
         with ended_on_request(), notes_shown():
+            command.check_machine()
             command.run()
     except BrokenPipeError:
         raise
     except (CompGSError, OSError, MemoryError) as error:
         if command.debug:
             raise
-        return fail(error)
+        return fail(error, exchanged(command, words))
     except KeyboardInterrupt as stop:
         with held_back():
             errors.print(escape(str(stop) or "interrupted"))
@@ -127,9 +134,11 @@ def run(command: Command) -> int:
     return 0
 
 
-def fail(error: Exception) -> int:
-    """Says what is wrong; the exit code."""
+def fail(error: Exception, meant: str | None = None) -> int:
+    """Says what is wrong, and which command was probably `meant`; the exit code."""
     errors.print(f"[bold red]error:[/] {escape(explain(error))}")
+    if meant is not None:
+        errors.print(f"did you mean: {escape(meant)}")
     return 2 if isinstance(error, UsageError) else 1
 
 

@@ -15,11 +15,12 @@ from rich.progress import (
 )
 
 from compgs.cli.console import console, say
-from compgs.words import duration, size
+from compgs.progress import parts_of
 
 if TYPE_CHECKING:
     from compgs.training import TrainingStatus
 
+WORTH_SAYING = 600.0  # seconds of a training on large photographs
 LINE_SECONDS = 15.0  # between two plain lines
 BAR_WIDTH = 12  # columns of the bar beside the words of a training
 
@@ -71,19 +72,36 @@ def training() -> Iterator[Callable[["TrainingStatus"], None]]:
         yield show
 
 
-def parts_of(status: "TrainingStatus") -> list[str]:
-    """The parts of a progress line, the most important first."""
-    rate = 1 / status.seconds_per_step if status.seconds_per_step > 0 else 0.0
-    return [
-        f"step {status.step:,} of {status.steps:,}",
-        time_left(status),
-        f"PSNR {status.psnr:.1f} dB",
-        f"~{size(status.estimated_bytes)}",
-        f"{status.primitives:,} {status.kind}",
-        f"{rate:.1f} steps/s",
-        f"loss {status.loss:.4f}",
-        *([f"lambda {status.lmbda:.2g}"] if status.lmbda is not None else []),
-    ]
+class SizesSaid:
+    """Says once what a training on large photographs takes, and what it would take on smaller ones."""
+
+    def __init__(self) -> None:
+        self.said = False
+
+    def __call__(self, status: "TrainingStatus", pixels: int, downscale: int) -> None:
+        """`pixels` of a photograph as it is read, at 1 / `downscale` of its size."""
+        seconds = status.seconds_by_divisor
+        if self.said or not seconds:
+            return
+        self.said = True
+        if seconds[1] < WORTH_SAYING:
+            return
+        others = ", ".join(
+            f"-r {divisor * downscale} {about(each)}" for divisor, each in seconds.items() if divisor > 1
+        )
+        say(f"photographs of {pixels / 1e6:.1f} megapixels take {about(seconds[1])} here; with {others}")
+
+
+def about(seconds: float) -> str:
+    """`about 5 min`, `about 3 h 20 min`."""
+    minutes = max(1, round(seconds / 60))
+    if minutes < 60:
+        return f"about {minutes} min"
+    return (
+        f"about {minutes // 60} h {minutes % 60 // 10 * 10} min"
+        if minutes % 60 >= 10
+        else f"about {minutes // 60} h"
+    )
 
 
 def fitting(status: "TrainingStatus", room: int) -> str:
@@ -94,12 +112,6 @@ def fitting(status: "TrainingStatus", room: int) -> str:
             break
         shown += f"  {part}"
     return shown
-
-
-def time_left(status: "TrainingStatus") -> str:
-    """`4 min 05 s left`."""
-    seconds = round((status.steps - status.step) * status.seconds_per_step)
-    return f"{duration(seconds) if seconds >= 60 else f'{seconds} s'} left"
 
 
 def counting_lines(what: str) -> Callable[[int, int], None]:

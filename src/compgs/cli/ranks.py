@@ -22,7 +22,7 @@ def among_ranks(device: str | None) -> Iterator[bool]:
         with joined(chosen_device(device)):
             yield True
         return
-    console.quiet = True
+    quiet, console.quiet = console.quiet, True
     try:
         with joined(chosen_device(device)):
             yield False
@@ -32,7 +32,7 @@ def among_ranks(device: str | None) -> Iterator[bool]:
         errors.quiet = True  # rank 0 has said it
         raise
     finally:
-        console.quiet = False
+        console.quiet = quiet
 
 
 def several() -> bool:

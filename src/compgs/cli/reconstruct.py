@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from compgs.cli.command import NO_DEFAULT, Command
-from compgs.cli.console import console, say
+from compgs.cli.console import console, say, warn
 from compgs.cli.progress import LINE_SECONDS, counting_lines
 from compgs.cli.usage import check_range, settings_of_options
 from compgs.words import duration
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from compgs.reconstruct import Reconstruction
     from compgs.reconstruct.mapping import Progress as StageProgress
 
+ENOUGH_JOINED = 0.75  # of the photographs: if fewer have a pose, something went wrong
 MOST_NAMES = 5  # of photographs without a pose, that are listed
 
 
@@ -122,7 +123,18 @@ def show(result: "Reconstruction") -> None:
         say(f"note: without a pose: {names}")
     if result.missing and result.models > 1:
         say(f"note: {result.models} parts could not be joined; the largest is the scene")
+    if result.registered < ENOUGH_JOINED * result.photographs:
+        warn(
+            f"only {result.registered} of {result.photographs} photographs have a pose: the scene shows no more than "
+            f"what these saw. {remedy(result.matching)}"
+        )
     say(f"{result.scene / 'reconstruction.png'} shows cameras and points; next: compgs train {result.scene}")
+
+
+def remedy(matching: str) -> str:
+    """What lets COLMAP join more photographs, after it has compared them in this way."""
+    search = "--matching exhaustive and --features 8192" if matching == "sequential" else "--features 8192"
+    return f"{search} may join more, and more photographs between those that lie far apart surely will"
 
 
 @contextmanager

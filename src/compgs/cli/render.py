@@ -28,10 +28,16 @@ if TYPE_CHECKING:
 
 BLACK = (0.0, 0.0, 0.0)
 # Of the way through a scene, and of the circle around it, where nothing else is asked for.
-FRAMES, WIDTH, HEIGHT = 60, 640, 480
-UP, ELEVATION, DISTANCE = (0.0, -1.0, 0.0), 25.0, 2.2
+FRAMES = 60
+# As many pixels have pictures of another shape.
+WIDTH, HEIGHT = 640, 480
+UP = (0.0, -1.0, 0.0)
+# Of the circle, in the order in which they are tried: the first is taken that keeps clear of what is near.
+ELEVATIONS, DISTANCES = (25.0, 40.0, 60.0), (2.2, 1.6, 3.0)
 OF_WAY, OF_CIRCLE = ("path", "frames", "width", "height"), ("up", "elevation", "distance")
 MAX_SIDE = 16_384  # pixels
+# What somebody who names such a file does not want as a folder.
+OTHER_MEDIA = (".apng", ".avi", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".webm", ".webp")
 VIDEO_BYTES = 16 << 20  # that must be free for a video; a long one fails later
 
 
@@ -54,12 +60,14 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
 
     compgs render garden.cgs --frames 120 --width 960 --height 540 -o garden.mp4
 
+    compgs render garden.cgs --frames 40 --width 320 --fps 15 -o garden.gif
+
     compgs render garden.cgs --path path.json --frames 300 -o flight.mp4
     """
 
-    output: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER|MP4")]
-    """Folder for the images, or a video: a name that ends in .mp4 (needs `pip install '.[video]'` in the project's
-    folder)."""
+    output: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER|MP4|GIF")]
+    """Folder for the images, or one file for all of them: a video, a name that ends in .mp4 (needs `pip install
+    '.[video]'` in the project's folder), or an animation, .gif."""
 
     background: Annotated[
         tuple[float, float, float] | None, arg(metavar="R G B", help_behavior_hint=NO_DEFAULT)
@@ -84,12 +92,13 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
     a camera file, in their order."""
 
     fps: Annotated[float, arg(metavar="N")] = 30.0
-    """Frames per second of a video."""
+    """Frames per second of a video or animation."""
 
-    width: Annotated[int | None, arg(metavar="PIXELS", help_behavior_hint=f"(default: {WIDTH})")] = None
-    """Of the images of the way."""
+    width: Annotated[int | None, arg(metavar="PIXELS", help_behavior_hint=NO_DEFAULT)] = None
+    """Of the images of the way. With --width or --height alone, and with neither, they have the shape of the capture's;
+    with neither they are about 640 x 480 pixels."""
 
-    height: Annotated[int | None, arg(metavar="PIXELS", help_behavior_hint=f"(default: {HEIGHT})")] = None
+    height: Annotated[int | None, arg(metavar="PIXELS", help_behavior_hint=NO_DEFAULT)] = None
     """Of the images of the way."""
 
     up: Annotated[
@@ -99,14 +108,14 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
     """Direction of the sky, for the circle."""
 
     elevation: Annotated[
-        float | None, arg(metavar="DEGREES", help_behavior_hint=f"(default: {ELEVATION:g})")
+        float | None, arg(metavar="DEGREES", help_behavior_hint=f"(default: {ELEVATIONS[0]:g})")
     ] = None
-    """Of the circle, above the horizon."""
+    """Of the circle, above the horizon; by default higher where it would lead through something."""
 
-    distance: Annotated[float | None, arg(metavar="RADII", help_behavior_hint=f"(default: {DISTANCE:g})")] = (
-        None
-    )
-    """Of the circle from the middle of the scene."""
+    distance: Annotated[
+        float | None, arg(metavar="RADII", help_behavior_hint=f"(default: {DISTANCES[0]:g})")
+    ] = None
+    """Of the circle from the middle of the scene; by default another one where it would lead through something."""
 
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace the video, or the images that are in FOLDER already: all of them, also those beyond the new ones."""
@@ -137,7 +146,8 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
 
     @property
     def video(self) -> bool:
-        return self.output.suffix.lower() == ".mp4"
+        """Whether all frames become one file."""
+        return self.output.suffix.lower() in (".mp4", ".gif")
 
     def check_values(self) -> None:
         """Raises UsageError."""
@@ -168,14 +178,19 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
         if self.split is not None and source is None:
             raise UsageError(f"--split {self.split}: of the views of a scene; give the scene, too")
 
-    @property
-    def pictures(self) -> "Pictures":
-        """How many frames a way has, and their size."""
-        return {
-            "frames": self.frames or FRAMES,
-            "width": self.width or WIDTH,
-            "height": self.height or HEIGHT,
-        }
+    def pictures(self, like: "Sequence[Camera]") -> "Pictures":
+        """How many frames a way has, and their size: of the shape that the cameras' pictures have, where there are
+        some and nothing else is asked for.
+        """
+        shape = like[0].width / like[0].height if like else WIDTH / HEIGHT
+        if self.width is None and self.height is None:
+            # As many pixels as usual, however long the one side is.
+            width = even((WIDTH * HEIGHT * shape) ** 0.5)
+            height = even(width / shape)
+        else:
+            width = self.width or even((self.height or HEIGHT) * shape)
+            height = self.height or even(width / shape)
+        return {"frames": self.frames or FRAMES, "width": width, "height": height}
 
     def first_given(self, *options: str) -> str | None:
         """Return the first of these options that was given."""
@@ -188,14 +203,19 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
         return self.scene_source() if self.scene or self.source else None
 
     def check_output(self) -> None:
-        """Raises OutputError, MissingDependency."""
+        """Raises UsageError, OutputError, MissingDependency."""
+        if self.output.suffix.lower() in OTHER_MEDIA:
+            raise UsageError(
+                f"--output {self.output}: expected a folder for PNG images, or a name that ends in .mp4 or .gif"
+            )
         if not self.video:
             check_output_folder(self.output, overwrite=self.overwrite)
             return
         from compgs.evaluation.video import check_video
 
         check_output_file(self.output, overwrite=self.overwrite, needed_bytes=VIDEO_BYTES)
-        check_video()
+        if self.output.suffix.lower() == ".mp4":
+            check_video()
 
     def keyframes(self) -> "Sequence[Camera]":
         """Read the keyframes of a `--path` that is a file. Raises UsageError, SceneError."""
@@ -229,7 +249,11 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
         return [(view.name, view.camera) for view in chosen]
 
     def way(self, model: "Renderable", keyframes: "Sequence[Camera]") -> "Sequence[tuple[str, Camera]]":
-        """Return a way through the given cameras, along the file's, or in a circle. Raises UsageError."""
+        """Return a way through the given cameras, along the file's, or in a circle, clear of what is near.
+
+        Raises UsageError.
+        """
+        from compgs.evaluation.clearance import FreeSpace
         from compgs.evaluation.tour import tour, way_through
 
         cameras = model.viewpoints
@@ -237,27 +261,26 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
             return self.circle(model)
         if name := self.first_given(*OF_CIRCLE):
             raise UsageError(f"--{name}: of the circle around the scene; give it with --path orbit")
-        if keyframes:
-            way = way_through(keyframes, **self.pictures)
+        if keyframes:  # somebody has chosen them: the way is theirs
+            way = way_through(keyframes, **self.pictures(keyframes))
             return [(f"path {i}", camera) for i, camera in enumerate(way)]
         if len(cameras) < 2:
             raise UsageError(f"--path cameras: {self.file} keeps {len(cameras)} cameras; use --path orbit")
-        return tour(cameras, **self.pictures)
+        space = FreeSpace(model, cameras)
+        frames = tour(cameras, **self.pictures(cameras), passable=space.is_passable)
+        clear = space.kept_clear([camera for _, camera in frames])
+        return [(name, camera) for (name, _), camera in zip(frames, clear, strict=True)]
 
     def circle(self, model: "Renderable") -> "Sequence[tuple[str, Camera]]":
-        import numpy as np
+        from compgs.evaluation.clearance import clear_orbit
 
-        from compgs.evaluation.camera_path import orbit
-
-        circle = orbit(
-            model.bounds[0],
-            **self.pictures,
+        return clear_orbit(
+            model,
+            **self.pictures(model.viewpoints),
             up=self.up or UP,
-            elevation=ELEVATION if self.elevation is None else self.elevation,
-            distance=self.distance or DISTANCE,
+            elevations=ELEVATIONS if self.elevation is None else (self.elevation,),
+            distances=DISTANCES if self.distance is None else (self.distance,),
         )
-        # Around the model's own frame; cameras are given in the world's.
-        return [(name, camera.moved(-np.array(model.world_offset))) for name, camera in circle]
 
     def render(self, model: "Renderable", views: "Sequence[tuple[str, Camera]]") -> None:
         times: list[float] = []
@@ -271,13 +294,15 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
 
     def write_video(self, frames: "Iterator[np.ndarray]", views: "Sequence[tuple[str, Camera]]") -> None:
         """Raises UsageError, OutputError."""
+        from compgs.evaluation.animation import write_animation
         from compgs.evaluation.video import write_video
 
         sizes = sorted({(camera.width, camera.height) for _, camera in views})
         if len(sizes) > 1:
             found = ", ".join(f"{width} x {height}" for width, height in sizes[:2])
             raise UsageError(f"{self.output}: a video has one size, the views have {found}; name a folder")
-        write_video(self.output, frames, frames_per_second=self.fps)
+        write = write_animation if self.output.suffix.lower() == ".gif" else write_video
+        write(self.output, frames, frames_per_second=self.fps)
 
     def write_images(self, frames: "Iterator[np.ndarray]", views: "Sequence[tuple[str, Camera]]") -> None:
         from compgs.evaluation.camera_path import camera_entry
@@ -295,6 +320,11 @@ class Pictures(TypedDict):
     frames: int
     width: int  # pixels
     height: int  # pixels
+
+
+def even(pixels: float) -> int:
+    """Round to an even number, as videos want their sides."""
+    return min(MAX_SIDE, max(2, 2 * round(pixels / 2)))
 
 
 def rendered(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from compgs.cli.command import ReadingOptions, check_measures
 from compgs.cli.console import say
+from compgs.cli.ending import say_next
 from compgs.cli.plan import plan_in, planned, say_lines
 from compgs.cli.progress import counting_runs
 from compgs.cli.ranks import several
@@ -172,6 +173,7 @@ def train_tiles(command: "Train", settings: RunSettings) -> None:
     whole = sum(file.stat().st_size for file in manifest.parent.iterdir())
     say(f"{manifest.parent}: {len(jobs)} tiles, {size(whole)}")
     command.evaluate(scene, manifest, folder, settings)
+    say_next(manifest.parent)
 
 
 def _plan(

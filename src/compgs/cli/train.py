@@ -3,7 +3,7 @@
 import shlex
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,15 +14,15 @@ from compgs.cli.command import (
     NO_DEFAULT,
     ComputingCommand,
     SceneOptions,
-    check_device,
     check_measures,
     one_scene,
     use_threads,
 )
-from compgs.cli.console import print_profile, print_results, say
+from compgs.cli.console import print_profile, quality_of, say, say_remarks
+from compgs.cli.ending import say_miss, say_next
 from compgs.cli.offer import with_poses
 from compgs.cli.plan import plan_in, planned, say_lines, show_plan
-from compgs.cli.progress import counting, training
+from compgs.cli.progress import SizesSaid, counting, training
 from compgs.cli.ranks import among_ranks, several, share_of_threads
 from compgs.cli.run_folder import (
     CHECKPOINT_NAME,
@@ -46,6 +46,7 @@ from compgs.errors import MissingSparseModel
 from compgs.extras import require
 from compgs.methods import METHODS, Method, settings_of, train
 from compgs.numerics.compiling import working_seconds
+from compgs.occupied import occupied
 from compgs.outputs import check_output_folder, write_json
 from compgs.words import duration, size
 
@@ -58,7 +59,6 @@ NEEDED_BYTES = (
     64 << 20
 )  # checkpoint, file and renders of a small scene; a large one fails later, but loses nothing
 BEGINS_AGAIN = "was stopped before its first checkpoint and begins again"
-NOTABLE_MISS = 0.05  # of the size that was asked for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +95,8 @@ class Train(ComputingCommand, SceneOptions):
 
     torchrun --nproc-per-node 8 -m compgs train scenes/garden -o runs/eight --set training.views_per_step=8 --steps 3750
     """
+
+    asked_for = ("scene", "output")
 
     output: Annotated[
         Path | None,
@@ -204,14 +206,17 @@ class Train(ComputingCommand, SceneOptions):
         if self.resume and self.overwrite:
             raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
         require("train", "training")
-        if self.device is not None:
-            check_device(self.device)
-        folder = self.output
+        with ExitStack() as to_the_end:
+            self.run_in(self.output, to_the_end)
+
+    def run_in(self, folder: Path, to_the_end: ExitStack) -> None:
+        """Everything, in the run's folder, which is this process's until the end."""
         with among_ranks(self.device) as leads:
             if leads:
                 check_output_folder(
                     folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES
                 )
+                to_the_end.enter_context(occupied(folder))
             settings = self.settings(folder)
             if settings.tiles is not None:
                 train_tiles(self, settings)
@@ -237,7 +242,8 @@ class Train(ComputingCommand, SceneOptions):
                 self.viewing(scene, folder.name) as viewing,
                 beginning(folder, settings, anew=not self.resume) as earlier,
             ):
-                model = self.train(scene, settings, folder, earlier, viewing)
+                trained = self.train(scene, settings, folder, earlier, viewing)
+        model = trained.model
         cut(model, settings)
         method = METHODS[settings.method]
         path = folder / file_name(folder, method.suffix)
@@ -245,12 +251,13 @@ class Train(ComputingCommand, SceneOptions):
         written = method.write(model, path, settings.config)
         seconds = working_seconds() - start
         add_facts(folder, {"encode_seconds": seconds})
-        say(f"{path}: {size(written)}, written in {duration(seconds)}")
+        say(f"{path}: {size(written)}, trained in {duration(trained.seconds)}")
         if settings.tile is not None:
             return  # tiles are evaluated together
         self.evaluate(scene, path, folder, settings)
         if settings.config.training.target_bytes is not None:
             say_miss(folder, settings.config.training.target_bytes)
+        say_next(path)
 
     @contextmanager
     def viewing(self, scene: "Scene", title: str) -> "Iterator[Viewing | None]":
@@ -356,11 +363,15 @@ class Train(ComputingCommand, SceneOptions):
         folder: Path,
         earlier: EarlierRun | None,
         viewing: "Viewing | None",
-    ) -> Any:
-        """The method's model. Raises KeyboardInterrupt, with what to do next, when the user stops it."""
+    ) -> "Trained":
+        """What the method gives. Raises KeyboardInterrupt, with what to do next, when the user stops it."""
         from compgs.training import History, StepProfile
 
-        history = History()
+        history, say_sizes = History(), SizesSaid()
+        camera = scene.train_views[0].camera if scene.train_views else None
+        pixels = camera.width * camera.height if camera else 0
+        # What is chosen by itself leaves no photograph large.
+        downscale = settings.scene.downscale if isinstance(settings.scene.downscale, int) else 1
         profile = StepProfile() if self.profile else None
         last: TrainingStatus | None = None
         continues = self.continues(folder)
@@ -372,6 +383,7 @@ class Train(ComputingCommand, SceneOptions):
                     nonlocal last
                     last = status
                     history.add(status)
+                    say_sizes(status, pixels, downscale)
                     if earlier is not None:
                         earlier.look()
                     show(status)
@@ -385,7 +397,7 @@ class Train(ComputingCommand, SceneOptions):
                     splats=settings.splats,
                     output=folder,
                     resume=continues,
-                    on_progress=on_progress,
+                    progress=on_progress,
                     device=self.device,
                     profile=profile,
                     watch=viewing,
@@ -414,10 +426,9 @@ class Train(ComputingCommand, SceneOptions):
                     "curve": history.curve(),
                 },
             )
-        say(f"trained in {duration(seconds)}")
         if profile:
             print_profile(profile.milliseconds())
-        return model
+        return Trained(model, seconds)
 
     def check_held_out(self, scene: "Scene", settings: RunSettings) -> None:
         """Raises SceneError, before the first step, for a held-out view that could not be measured after the last."""
@@ -446,32 +457,18 @@ class Train(ComputingCommand, SceneOptions):
             )
         if settings.plan is not None:
             add_facts(folder, {"plan": settings.plan}, RESULTS_NAME)
-        say("")
-        print_results(results)
-        say("")
+        say(quality_of(results))
         say(f"renders beside photographs: {folder / 'contact_sheet.png'}")
         say(f"for programs: {folder / 'results.json'}, {folder / 'per_view.json'}")
+        say_remarks(results)
 
 
-def say_miss(folder: Path, target: int) -> None:
-    """How far from the size that was asked for the file is; training.json gets it too."""
-    written = (folder / file_name(folder)).stat().st_size
-    miss = written / target - 1
-    say(f"asked {size(target)}, written {size(written)}: {100 * miss:+.1f} %")
-    facts = add_facts(folder, {"target_bytes": target, "bytes": written, "miss": miss})
-    if abs(miss) > NOTABLE_MISS:
-        from compgs.training.rate.rate_control import HIGHEST, LOWEST
+@dataclass(frozen=True)
+class Trained:
+    """A model, and how long its training took."""
 
-        lmbda = (
-            f"lambda ended at {facts['lmbda']:.3g}, within {LOWEST:g} to {HIGHEST:g}"
-            if "lmbda" in facts
-            else "lambda"
-        )
-        way = "fewer anchors (model.voxel_spacings)" if miss > 0 else "more anchors (model.voxel_spacings)"
-        say(
-            f"note: {size(written)} is what these settings reached ({lmbda}); more --steps let it settle, "
-            f"{way} or another --preset move the range"
-        )
+    model: Any
+    seconds: float
 
 
 def in_words(settings: RunSettings) -> str:

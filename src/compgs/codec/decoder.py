@@ -20,6 +20,7 @@ from compgs.model.arrays import PrimitiveArrays
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.head_weights import HeadDimensions, HeadWeights
 from compgs.model.hybrid_model import HybridModel
+from compgs.paths import as_path
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -36,7 +37,7 @@ def decode(path: "str | Path", device: "Device | None" = None, *, prefix: int | 
     Raises a BitstreamError that names the file and the section if it cannot be decoded, or read at all, and ConfigError
     for a negative `prefix`.
     """
-    path = Path(path)
+    path = as_path(path, "path")
     if prefix is not None and prefix < 0:
         raise ConfigError(f"prefix = {prefix}: expected a number of bytes")
     try:

@@ -41,6 +41,7 @@ from compgs.entropy.quantization import weight_exponent
 from compgs.errors import NotEncodable
 from compgs.ordering.order import canonical_order
 from compgs.outputs import check_output_file, write_bytes
+from compgs.paths import as_path
 from compgs.trained_model import TrainedModel
 
 ONE = 1 << FRACTION_BITS
@@ -67,10 +68,10 @@ def encode(
     """
     if not isinstance(model, TrainedModel):
         raise NotEncodable(
-            f"expected a trained model, as compgs.train and load_run give it, found {type(model).__name__}; "
-            "a decoded file is a .cgs file already: copy it"
+            f"expected a trained model, as compgs.train gives it, and compgs.training.load_run of a run's folder, "
+            f"found {type(model).__name__}; a decoded file is a .cgs file already: copy it"
         )
-    path = Path(path)
+    path = as_path(path, "path")
     check_output_file(path, overwrite=overwrite)
     data, content = encoded(model, geometry)
     write_bytes(path, data)

@@ -9,13 +9,14 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from compgs.codec import encode
 from compgs.compressing import run
 from compgs.compressing.comparison import Compared, compare
+from compgs.compressing.deadline import ENOUGH, Deadline
 from compgs.compressing.given import given_cameras
 from compgs.compressing.pace import steps_within
 from compgs.compressing.placing import Placed, between, place_cameras
@@ -31,7 +32,9 @@ from compgs.evaluation.results import Results
 from compgs.formats import component_bytes, format_of, open_scene
 from compgs.methods import train
 from compgs.model.splats import SplatModel
+from compgs.occupied import occupied
 from compgs.outputs import check_output_file, check_output_folder, write_json
+from compgs.progress import shown_training
 from compgs.scene.views import Scene
 from compgs.training import Plan, TrainingStatus, plan_for
 from compgs.training.run.checkpoint import CHECKPOINT_NAME
@@ -85,12 +88,13 @@ def compress(
     resume: bool = False,
     overwrite: bool = False,
     device: str | None = None,
-    on_progress: Callable[[TrainingStatus], None] | None = None,
+    progress: Callable[[TrainingStatus], None] | Literal[False] | None = None,
 ) -> Compressed:
     """Write splats (.ply, .spz, .sog or another format that is read) as a .cgs file, by training on renderings of them.
 
     Settings are those of `config`, or of a preset; of neither, those of `default` with STEPS steps. With `seconds` the
-    number of steps is chosen, before the training, so that the file is there after about that long. `looking` says from
+    number of steps is chosen so that the file is there after about that long, and steps are passed over where the
+    machine becomes slower meanwhile. `looking` says from
     where the splats are looked at: places are found where there is something to see, unless cameras are named.
 
     Beside the file, in `folder_of(output)`, are a checkpoint, from which `resume` goes on with the settings it began
@@ -99,17 +103,20 @@ def compress(
     Raises SplatFileError, NotACompGSFile, SceneError, ConfigError, CheckpointError, OutputError, TrainingError.
     """
     output, source = Path(output), Path(source)
-    if resume:
-        compression = resumed(output, source, device=device)
-    else:
-        if config is not None and preset is not None:
-            raise ConfigError(f"config and preset={preset!r} were both given: give one")
-        chosen = config or default_config(preset)
-        compression = begin(
-            source, output, chosen, looking, seconds=seconds, overwrite=overwrite, device=device
-        )
-    compression.train(on_progress)
-    return compression.judge()
+    if config is not None and preset is not None:
+        raise ConfigError(f"config and preset={preset!r} were both given: give one")
+    check_places(output, overwrite=overwrite or resume)
+    with occupied(folder_of(output)):
+        if resume:
+            compression = resumed(output, source, device=device)
+        else:
+            chosen = config or default_config(preset)
+            compression = begin(
+                source, output, chosen, looking, seconds=seconds, overwrite=overwrite, device=device
+            )
+        with shown_training(progress) as show:
+            compression.train(show)
+        return compression.judge(_silent if progress is False else None)
 
 
 def default_config(preset: str | None = None) -> Config:
@@ -131,19 +138,35 @@ class Compression:
     device: str
     plan: Plan  # what the training has decided
     goes_on: bool = False  # from a checkpoint
+    deadline: Deadline | None = None  # of the training
 
-    def train(self, on_progress: Callable[[TrainingStatus], None] | None = None) -> int:
+    def train(self, progress: Callable[[TrainingStatus], None] | None = None) -> int:
         """Train, or go on with it, and write the file; its bytes. Raises TrainingError, OutputError."""
+
+        def tell(status: TrainingStatus) -> None:
+            if self.deadline is not None:
+                self.deadline.tell(status)
+            if progress is not None:
+                progress(status)
+
+        watch: Any = self.deadline  # it asks the training to pass over steps, as only this method's can
         model = train(
             self.scene,
             self.begun.config,
             output=folder_of(self.file),
             resume=self.goes_on,
-            on_progress=on_progress,
+            progress=tell,
             device=self.device,
             plan=self.plan,
+            watch=watch,
         )
         return encode(model, self.file, overwrite=True).bytes
+
+    @property
+    def steps(self) -> int:
+        """Steps of the run that are, or were, learned in."""
+        taken = 0 if self.deadline is None else self.deadline.taken
+        return taken or self.begun.config.training.steps
 
     def judge(self, progress: Progress | None = None) -> Compressed:
         """The written file, and other formats, against the splats; all that is found is written down, too."""
@@ -164,10 +187,10 @@ class Compression:
             splats=len(self.splats.splats),
             file=self.file,
             folder=folder,
-            steps=self.begun.config.training.steps,
+            steps=self.steps,
             results=results,
             others=compared.files,
-            notes=compared.notes,
+            notes=compared.notes + (() if self.deadline is None else rough(self.steps)),
         )
         write_json(folder / "results.json", {**compressed.to_dict(), "plan": self.plan.to_dict()})
         return compressed
@@ -185,7 +208,7 @@ def begin(
     progress: Progress | None = None,
 ) -> Compression:
     """Find cameras, start anchors, and choose the steps if `seconds` are given. Raises as `compress` does."""
-    start = time.perf_counter()
+    start = time.monotonic()
     check_config(config)
     looking = looking or Looking()
     looking.check()
@@ -196,14 +219,31 @@ def begin(
     placed = placed_cameras(splats, looking, config.training.seed, progress)
     scene, size = scene_of(splats, placed, source, config)
     config = replace(config, model=replace(config.model, voxel_size=size))
+    deadline = None
     if seconds is not None:
-        left = seconds * (1 - FOR_THE_REST) - (time.perf_counter() - start)
-        steps = steps_within(scene, config, left, device)
+        end = start + seconds * (1 - FOR_THE_REST)
+        steps = steps_within(scene, config, end - time.monotonic(), device)
         config = replace(config, training=replace(config.training, steps=steps))
+        deadline = Deadline(end, steps)
     begun = Begun(source, digest(source), looking, placed, config)
     run.save(folder_of(output), begun)
     device = chosen_device(device)
-    return Compression(begun, splats, scene, output, device, plan_for(scene, config, training_device(device)))
+    plan = plan_for(scene, config, training_device(device))
+    return Compression(begun, splats, scene, output, device, plan, deadline=deadline)
+
+
+def _silent(done: int, total: int) -> None:
+    """Nothing is shown."""
+
+
+def rough(steps: int) -> tuple[str, ...]:
+    """What to say of a file that was trained for so many steps, if it is rough."""
+    if steps >= ENOUGH:
+        return ()
+    return (
+        f"{steps:,} steps are few, and the file is rough: from {ENOUGH:,} on it shows what the splats do, and "
+        f"{STEPS:,} are the default; give it more time",
+    )
 
 
 def resumed(output: Path, source: Path | None = None, *, device: str | None = None) -> Compression:

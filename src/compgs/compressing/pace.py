@@ -2,19 +2,20 @@
 
 import time
 from dataclasses import replace
+from statistics import fmean
 
+from compgs.compressing.deadline import FEWEST
 from compgs.config import Config
 from compgs.methods import train
 from compgs.scene.views import Scene
 from compgs.training import TrainingStatus, plan_for
 from compgs.training.run.loop import chosen_device
 
-TRIED = 40  # steps; the pace is that of the later ones
+TRIED = 40  # steps
 TRIED_VIEWS = 12
 # A step of the whole run, in steps of its beginning: anchors grow, then most of them are pruned, and the rate is always
 # counted in (measured: docs/results/compress.md).
 WHOLE_RUN = 1.0
-FEWEST = 200  # steps: fewer make nothing that could be looked at
 
 
 def steps_within(scene: Scene, config: Config, seconds: float, device: str | None) -> int:
@@ -26,15 +27,16 @@ def steps_within(scene: Scene, config: Config, seconds: float, device: str | Non
 
 
 def seconds_per_step(scene: Scene, config: Config, device: str | None) -> float:
-    """Seconds of a step with everything in it, after the first ones, which load and compile kernels.
+    """Seconds of a step with everything in it, as long as the steps of a run are on average: the first ones look at
+    coarse photographs, as in a whole run. The very first, which loads and compiles kernels, does not count.
 
     The plan is the whole scene's: the few views that are tried would make another one.
     """
     plan = plan_for(scene, config, chosen_device(device))
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
-    last: list[TrainingStatus] = []
-    train(replace(scene, train_views=views), trial(config), device=device, on_progress=last.append, plan=plan)
-    return last[-1].seconds_per_step
+    told: list[TrainingStatus] = []
+    train(replace(scene, train_views=views), trial(config), device=device, progress=told.append, plan=plan)
+    return fmean(status.seconds_per_step for status in told)
 
 
 def trial(config: Config) -> Config:

@@ -41,7 +41,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numba
 import numpy as np
@@ -60,6 +60,8 @@ from compgs.formats.tiled_scene import TiledScene
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
 from compgs.outputs import check_output_folder, filling, write_bytes, write_json
+from compgs.paths import as_path
+from compgs.progress import counted
 from compgs.render import Renderable
 from compgs.scene import as_scene
 from compgs.scene.views import Scene, View
@@ -220,6 +222,7 @@ class Comparison:
         return [dataclasses.asdict(view) for view in self.per_view]
 
 
+@counted("comparing views")
 def compare(
     a: str | Path,
     b: str | Path,
@@ -231,7 +234,7 @@ def compare(
     overwrite: bool = False,
     lpips: bool | str | Path = False,
     device: "Device | None" = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | Literal[False] | None = None,
 ) -> Comparison:
     """Open two files of any known formats (`compgs.formats`) and compare what they show.
 
@@ -246,7 +249,7 @@ def compare(
 
     Raises BitstreamError, SplatFileError, SceneError, OutputError.
     """
-    paths = scene_file(Path(a)), scene_file(Path(b))
+    paths = scene_file(as_path(a, "a")), scene_file(as_path(b, "b"))
     for path in paths:
         check_scene(path)
     if scene is not None and cameras is not None:
@@ -258,7 +261,7 @@ def compare(
     sides, notes = _opened(paths, chosen, read, background)
     places, origin = _places(sides, read, cameras)
     if output is None:
-        return _compared(sides, places, origin, read, notes, chosen, lpips, progress)
+        return _compared(sides, places, origin, read, notes, chosen, lpips, progress or None)
     with filling(Path(output)) as folder:
         page = ComparisonPage(scene_name(paths[0]), scene_name(paths[1]))
 
@@ -267,7 +270,7 @@ def compare(
                 write_bytes(folder / name / row.file, encode_png(picture))
             page.keep(row, pictures)
 
-        found = _compared(sides, places, origin, read, notes, chosen, lpips, progress, keep)
+        found = _compared(sides, places, origin, read, notes, chosen, lpips, progress or None, keep)
         write_json(folder / "cameras.json", [camera_entry(place.camera, place.name) for place in places])
         write_json(folder / "per_view.json", found.per_view_list())
         write_json(folder / "results.json", found.to_dict())

@@ -4,7 +4,7 @@ import hashlib
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numba
 import numpy as np
@@ -25,6 +25,8 @@ from compgs.evaluation.results import Results, ViewResult
 from compgs.formats import component_bytes, open_scene, scene_file, scene_name
 from compgs.numerics.compiling import working_seconds
 from compgs.outputs import check_output_folder, write_bytes, write_json
+from compgs.paths import as_path
+from compgs.progress import counted
 from compgs.render import Renderable, render
 from compgs.render.depth import depth
 from compgs.scene import as_scene
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 SHEET_ROWS = 4  # views on the contact sheet
 
 
+@counted("evaluating views")
 def evaluate(
     file: str | Path,
     scene: Scene | str | Path,
@@ -46,7 +49,7 @@ def evaluate(
     flip: bool = False,
     errors: bool = False,
     device: "Device | None" = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | Literal[False] | None = None,
     method: str | None = None,
     exposure: bool = False,
     truth: str = "photograph",
@@ -70,7 +73,7 @@ def evaluate(
     Raises BitstreamError, SplatFileError, OutputError, SceneError if the scene holds no view out or a mask leaves
     nothing, and MissingDependency where FLIP is asked for and cannot be measured.
     """
-    path, scene = scene_file(Path(file)), as_scene(scene)
+    path, scene = scene_file(as_path(file, "file")), as_scene(scene)
     if output is not None:
         check_output_folder(Path(output), overwrite=overwrite)
     if flip:

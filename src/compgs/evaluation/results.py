@@ -37,6 +37,8 @@ from dataclasses import dataclass
 from statistics import fmean, median
 from typing import TYPE_CHECKING, Any
 
+from compgs.pictures import table
+
 if TYPE_CHECKING:
     from compgs.evaluation.error_account import ErrorAccount
 
@@ -133,6 +135,14 @@ class Results:
 
     def _bits_per(self, count: int | None) -> float | None:
         return None if count is None else 8 * self.bytes / count
+
+    def __repr__(self) -> str:
+        return f"Results({self.file!r}, PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}, {self.bytes:,} bytes)"
+
+    def _repr_html_(self) -> str:
+        """Show in a notebook what there is."""
+        facts = {"PSNR": f"{self.psnr:.2f} dB", "SSIM": f"{self.ssim:.4f}", "bytes": f"{self.bytes:,}"}
+        return table(self.file, {**facts, "views": len(self.per_view)})
 
     def to_dict(self) -> dict[str, Any]:
         """The content of `results.json`."""

@@ -1,7 +1,7 @@
 """A way through a scene along cameras that it was captured from: where they stood there is something to see."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_
 
 # Of the tour's other legs' median: a longer leg leads through what nobody has seen, and is left out.
 LONGEST_LEG = 3.0
+BLOCKED = 100.0  # of the greatest distance: what a way costs that is not passable
 TURNING = 1.0  # spreads of the positions that a change of direction by one (of unit vectors) counts as
 
 
@@ -21,15 +22,17 @@ def tour(
     frames: int,
     width: int,
     height: int,
+    passable: Callable[[Camera, Camera], bool] | None = None,
 ) -> list[tuple[str, Camera]]:
     """`frames` cameras on a smooth way along the given ones, with the first one's field of view across.
 
     The shortest round tour (nearest neighbours, then 2-opt), without its longest leg where that is much longer than
-    the others; see `way_through`. Raises UnsupportedCamera for fewer than two cameras.
+    the others; see `way_through`. Where it is not `passable` from one camera to another, the way leads by others, if
+    there is such a way. Raises UnsupportedCamera for fewer than two cameras.
     """
     if len(cameras) < 2:
         raise UnsupportedCamera(f"a way along cameras needs two of them, found {len(cameras)}")
-    order, closed = tour_order(cameras)
+    order, closed = tour_order(cameras, passable)
     first = cameras[0]
     across = first.fx / first.width
     chosen = [replace(cameras[i], fx=across * cameras[i].width) for i in order]
@@ -82,9 +85,13 @@ def _legs(centers: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     return np.maximum(shares, 1e-9)
 
 
-def tour_order(cameras: Sequence[Camera]) -> tuple[list[int], bool]:
-    """Order of the cameras on their tour, and whether it is closed; an open one begins behind its longest leg."""
-    distance = _distances(cameras)
+def tour_order(
+    cameras: Sequence[Camera], passable: Callable[[Camera, Camera], bool] | None = None
+) -> tuple[list[int], bool]:
+    """Order of the cameras on their tour, and whether it is closed; an open one begins behind its longest leg. Cameras
+    come several times where the way between two others leads by them.
+    """
+    distance, by = _passable_distances(cameras, passable)
     order = [0]
     left = set(range(1, len(cameras)))
     while left:
@@ -95,8 +102,41 @@ def tour_order(cameras: Sequence[Camera]) -> tuple[list[int], bool]:
     longest = int(np.argmax(legs))
     others = legs[:longest] + legs[longest + 1 :]
     if len(cameras) > 2 and legs[longest] <= LONGEST_LEG * max(float(np.median(others)), 1e-30):
-        return order, True
-    return order[longest + 1 :] + order[: longest + 1], False
+        return _expanded([*order, order[0]], by)[:-1], True
+    return _expanded(order[longest + 1 :] + order[: longest + 1], by), False
+
+
+def _passable_distances(
+    cameras: Sequence[Camera], passable: Callable[[Camera, Camera], bool] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """[V, V] distances on the shortest passable ways, and [V, V] int64: which camera comes next on such a way."""
+    distance, count = _distances(cameras), len(cameras)
+    following = np.tile(np.arange(count), (count, 1))
+    if passable is None:
+        return distance, following
+    straight = distance.copy()
+    for one, other in itertools.combinations(range(count), 2):
+        if not passable(cameras[one], cameras[other]):
+            straight[one, other] = straight[other, one] = np.inf
+    shortest = straight.copy()
+    for by in range(count):  # Floyd and Warshall
+        detour = shortest[:, by, None] + shortest[by]
+        shorter = detour < shortest - 1e-12
+        following[shorter] = np.broadcast_to(following[:, by, None], following.shape)[shorter]
+        shortest[shorter] = detour[shorter]
+    # Where only what is in the way leads from one to the other: as straight as the crow flies, and last of all.
+    far = BLOCKED * max(float(distance.max()), 1e-30)
+    blocked = np.isinf(shortest)
+    return np.where(blocked, far + distance, shortest), following
+
+
+def _expanded(order: Sequence[int], following: np.ndarray) -> list[int]:
+    """Insert the cameras that the way from one to the next leads by."""
+    result = [order[0]]
+    for camera in order[1:]:
+        while result[-1] != camera:
+            result.append(int(following[result[-1], camera]))
+    return result
 
 
 def _distances(cameras: Sequence[Camera]) -> np.ndarray:

@@ -24,6 +24,7 @@ from compgs.formats import (
 )
 from compgs.formats.arrays import SplatArrays
 from compgs.model.splats import SplatModel
+from compgs.paths import as_path
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -172,7 +173,7 @@ def open_scene(
 
     Raises BitstreamError, SplatFileError, MissingDependency; ConfigError for a level that is not there.
     """
-    path = scene_file(Path(path))
+    path = scene_file(as_path(path, "path"))
     found = format_of(path)
     if level is None:
         return found.open(path, device, background)

@@ -3,13 +3,15 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from compgs.config import PRESETS, Config, check_config, config_from_dict, load_config
 from compgs.errors import ConfigError
 from compgs.extras import require
 from compgs.methods.method import Method
 from compgs.notes import note
+from compgs.occupied import occupied_if_given
+from compgs.progress import shown_training
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -50,7 +52,10 @@ def train(
     splats: "SplatModel | str | Path | None" = None,
     output: str | Path | None = None,
     resume: bool = False,
-    on_progress: "Callable[[TrainingStatus], None] | None" = None,
+    steps: int | None = None,
+    lmbda: float | None = None,
+    seed: int | None = None,
+    progress: "Callable[[TrainingStatus], None] | Literal[False] | None" = None,
     device: "Device | None" = None,
     profile: "StepProfile | None" = None,
     watch: "Watch | None" = None,
@@ -59,7 +64,9 @@ def train(
     """Train a scene, or the one in a folder, by a method; the result can be rendered, and written by
     `compgs.methods.write` (of `compgs`, also by `compgs.encode`).
 
-    Settings are those of `config` (`compgs.methods.settings_of`), or of a preset, `default` if there is neither. With
+    Settings are those of `config` (`compgs.methods.settings_of`), or of a preset, `default` if there is neither;
+    `steps`, `lmbda` (the weight of the rate) and `seed` go before them. A terminal and a notebook show how
+    far it is (`compgs.progress`), unless `progress` is False, or a function, which gets a `TrainingStatus`. With
     `output`, a folder, checkpoints are written there, also when the run is interrupted; `resume` continues from the
     last one exactly as if the run had not stopped (`compgs train --resume` cannot: it does not know how the scene was
     read). `splats`, or a file of them, take the place of the plain 3DGS that a method begins with. `profile` gathers
@@ -72,25 +79,29 @@ def train(
     """
     require("train", "training")
     from compgs.scene import as_scene
+    from compgs.training.run.distributed import rank
     from compgs.training.run.loop import Run
 
     known = method_of(method)
-    chosen = _chosen_config(known, config, preset)
+    changes = {"steps": steps, "lmbda": lmbda, "seed": seed}
+    chosen = _changed(known, _chosen_config(known, config, preset), changes)
     if splats is not None and not known.from_splats:
         raise ConfigError(f"splats: method {method} does not begin with plain 3DGS; leave them out")
     read = as_scene(scene)
     start = opened_splats(splats, read) if isinstance(splats, (str, Path)) else splats
-    run = Run(
-        method,
-        output=output,
-        resume=resume,
-        on_progress=on_progress,
-        device=device,
-        profile=profile,
-        watch=watch,
-        plan=plan,
-    )
-    return known.train(read, chosen, run, start)
+    # Of several processes that train together, the first writes.
+    with shown_training(progress) as show, occupied_if_given(None if rank() > 0 else output):
+        run = Run(
+            method,
+            output=output,
+            resume=resume,
+            on_progress=show,
+            device=device,
+            profile=profile,
+            watch=watch,
+            plan=plan,
+        )
+        return known.train(read, chosen, run, start)
 
 
 def write(model: Any, path: str | Path, *, method: str = "compgs", config: Config | None = None) -> int:
@@ -114,6 +125,21 @@ def opened_splats(path: str | Path, scene: "Scene") -> "SplatModel":
         note(Path(path), "its splats are antialiased, training goes on without: small ones begin too bright")
         model = replace(model, splats=replace(model.splats, antialiased=False))
     return model
+
+
+def _changed(method: Method, config: Config, changes: "dict[str, Any]") -> Config:
+    """Replace these settings of the training, those that are not None. Raises ConfigError for what is out of range, or
+    what the method has no use for.
+    """
+    given = {name: value for name, value in changes.items() if value is not None}
+    for name in given:
+        if "training" not in method.uses and f"training.{name}" not in method.uses:
+            raise ConfigError(
+                f"{name}: not a setting of method {method.name}, which has {', '.join(method.uses)}"
+            )
+    changed = replace(config, training=replace(config.training, **given))
+    check_config(changed)
+    return changed
 
 
 def _chosen_config(method: Method, config: Config | None, preset: str | None) -> Config:

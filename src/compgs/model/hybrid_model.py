@@ -12,6 +12,7 @@ from compgs.model.arrays import PrimitiveArrays
 from compgs.model.constants import CUTOFF_SIGMAS
 from compgs.model.head_weights import HeadWeights
 from compgs.model.inference import DrawnArrays, SceneArrays
+from compgs.pictures import table
 
 # Anchors are worked on in blocks, so that memory stays near the size of the result.
 BLOCK = 1 << 14
@@ -53,6 +54,13 @@ class HybridModel:
     def coupled(self) -> int:
         """Number of coupled primitives in the scene."""
         return len(self.primitives.residuals)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.anchors:,} anchors, {self.coupled:,} coupled primitives)"
+
+    def _repr_html_(self) -> str:
+        """Show in a notebook what there is."""
+        return table(type(self).__name__, {**self.counts, "viewpoints": len(self.viewpoints)})
 
     @property
     def counts(self) -> Mapping[str, int]:

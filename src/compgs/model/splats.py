@@ -15,6 +15,7 @@ from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.model.constants import CUTOFF_SIGMAS
 from compgs.model.degrees import degree_of, harmonics_above_dc
+from compgs.pictures import table
 
 ORIGIN = (0.0, 0.0, 0.0)
 
@@ -35,6 +36,9 @@ class SplatArrays:
     world_offset: tuple[float, float, float] = ORIGIN  # world units, float64
     # Whether they were trained with opacities that fall as dilation spreads a splat (`RasterSettings.antialiased`).
     antialiased: bool = False
+
+    def __repr__(self) -> str:
+        return f"SplatArrays({len(self):,} splats of degree {self.degree})"
 
     def __len__(self) -> int:
         return len(self.means)
@@ -106,6 +110,13 @@ class SplatModel:
     def antialiased(self) -> bool:
         """Whether opacities fall as dilation spreads the splats."""
         return self.splats.antialiased
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self.splats):,} splats)"
+
+    def _repr_html_(self) -> str:
+        """Show in a notebook what there is."""
+        return table(type(self).__name__, self.counts)
 
     @property
     def counts(self) -> Mapping[str, int]:

@@ -11,6 +11,7 @@ from typing import Literal
 from PIL import Image
 
 from compgs.errors import ConfigError, SceneError
+from compgs.occupied import occupied
 from compgs.outputs import check_output_folder, write_json
 from compgs.reconstruct import video
 from compgs.reconstruct.cameras import SharedCamera, lens_model, shared_camera
@@ -89,6 +90,19 @@ def reconstruct(
         raise SceneError(f"{source}: does not exist; expected a folder of photographs, or a video")
     check_output_folder(scene, overwrite=overwrite)
     work = scene.absolute().with_name(f".{scene.absolute().name}.{secrets.token_hex(8)}.partial")
+    with occupied(scene):
+        return _reconstruct_in(work, source, scene, options, progress, note)
+
+
+def _reconstruct_in(
+    work: Path,
+    source: Path,
+    scene: Path,
+    options: ReconstructOptions,
+    progress: Progress | None,
+    note: Callable[[str], None] | None,
+) -> Reconstruction:
+    """Reconstruct in a folder for what is made on the way, which is not there yet and goes again."""
     work.mkdir(parents=True)
     try:
         result = _reconstruct(source, scene, work, options, _Clock(progress or _silent))

@@ -1,7 +1,8 @@
 """The public face of rendering: a decoded or trained scene, seen from a camera."""
 
 import functools
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -117,10 +118,18 @@ class Trained(Protocol):
     def as_hybrid_model(self) -> Renderable: ...
 
 
+class HasCamera(Protocol):
+    """Such as a view of a scene."""
+
+    @property
+    def camera(self) -> Camera: ...
+
+
 def render(
-    model: Renderable | Trained, camera: Camera, settings: RasterSettings | None = None
+    model: Renderable | Trained, camera: "Camera | HasCamera", settings: RasterSettings | None = None
 ) -> RasterResult[np.ndarray]:
-    """One view of a scene, from a camera of the world, as numpy arrays. By default as `settings_of` has it.
+    """One view of a scene, from a camera of the world, or that of a view, as numpy arrays. By default as `settings_of`
+    has it.
 
     A trained model is quantized anew for each view; for many views, render its `as_hybrid_model()`. Raises ConfigError
     for what is no model.
@@ -128,16 +137,28 @@ def render(
     if isinstance(model, Trained):
         model = model.as_hybrid_model()
     if not isinstance(model, Renderable):
+        hint = "; compgs.open_scene(path) opens a file" if isinstance(model, (str, os.PathLike)) else ""
         raise ConfigError(
-            f"model: expected what compgs.train or compgs.decode gives, found {type(model).__name__}"
+            f"model: expected what compgs.train or compgs.decode gives, found {type(model).__name__}{hint}"
         )
-    camera = local_camera(model, camera)
+    camera = local_camera(model, _camera_of(camera))
     settings = settings or settings_of(model)
     if isinstance(model, DrawsItself):
         return model.draw(camera, settings)
     centers, radii = model.bounds
     visible = visible_mask(centers, radii, camera, settings)
     return rasterize_parts(model.parts(camera, visible), model.most_gaussians, camera, settings)
+
+
+def _camera_of(given: "Camera | HasCamera") -> Camera:
+    """Raises ConfigError for what has no camera."""
+    camera = getattr(given, "camera", given)
+    if isinstance(camera, Camera):
+        return camera
+    hint = "; render its cameras one by one" if isinstance(given, Sequence) else ""
+    raise ConfigError(
+        f"camera: expected a compgs.Camera or a view of a scene, found {type(given).__name__}{hint}"
+    )
 
 
 def blend_of(model: Renderable) -> Blend:

@@ -25,6 +25,7 @@ from typing import Literal
 import numpy as np
 
 from compgs.errors import ConfigError, MissingSparseModel, SceneError
+from compgs.progress import counted
 from compgs.scene.blender import TRAIN as SPLIT_FILE
 from compgs.scene.blender import read_blender
 from compgs.scene.capture import Capture, check_inside
@@ -48,6 +49,7 @@ FALLBACK_POINTS = 20_000  # random points of a scene without sparse points
 MAX_DOWNSCALE = 32  # beyond it somebody means a width in pixels
 
 
+@counted("reading views")
 def load_scene(
     path: str | Path,
     *,
@@ -57,7 +59,7 @@ def load_scene(
     holdout: bool = True,  # False: all views are trained on
     split: Split = "auto",  # which views are held out: `scene/hold_out.py`
     background: tuple[float, float, float] | None = None,  # display RGB, 0 to 1; None: the layout's
-    progress: Progress | None = None,  # called with (done, total) views
+    progress: Progress | Literal[False] | None = None,  # called with (done, total) views
     at_once: bool = True,  # photographs that all fit into memory are decoded now; False: when somebody looks
 ) -> Scene:
     """Reads a capture: COLMAP, nerfstudio (`transforms.json`) or a file for each split (`transforms_train.json`).
@@ -86,7 +88,7 @@ def load_scene(
     behind = background or capture.background
     cut_out = capture.cut_out and background is None
     found, decoded = load_views(
-        capture.images, factor, None if cut_out else behind, progress, at_once=at_once
+        capture.images, factor, None if cut_out else behind, progress or None, at_once=at_once
     )
     points, of_points = _enough_points(capture, found)
     extent = extent_of(found, points)

@@ -7,6 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from compgs.cameras import Camera
+from compgs.pictures import png, table
+
+THUMBNAILS = 6  # photographs of a scene that a notebook shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,6 +23,13 @@ class View:
     )  # [H, W, 3] uint8, display RGB, undistorted; or what reads them
     # [H, W] bool, True where a pixel counts (`scene/masks.py`), or what reads it; None: all count
     counted: np.ndarray | Callable[[], np.ndarray | None] | None = None
+
+    def __repr__(self) -> str:
+        return f"View({self.name!r}, {self.camera.width} x {self.camera.height} pixels)"
+
+    def _repr_png_(self) -> bytes:
+        """The photograph, in a notebook."""
+        return png(self.image)
 
     @property
     def image(self) -> np.ndarray:
@@ -39,6 +49,9 @@ class Points:
     positions: np.ndarray  # [P, 3] float64 as read, world units
     colors: np.ndarray  # [P, 3] uint8, display RGB
 
+    def __repr__(self) -> str:
+        return f"Points({len(self):,})"
+
     def __len__(self) -> int:
         return len(self.positions)
 
@@ -56,6 +69,24 @@ class Scene:
     source: Path  # the folder that was read
     notes: tuple[str, ...] = ()  # what was decided or replaced on loading, one sentence each
     split: str = ""  # how the held-out views were chosen, in words; empty: not known, or none is held out
+
+    def __repr__(self) -> str:
+        views = f"{len(self.train_views)} training views, {len(self.test_views)} held out"
+        return f"Scene({self.name!r}, {views}, {len(self.points):,} points)"
+
+    def _repr_html_(self) -> str:
+        """Show in a notebook what there is, and some of the photographs."""
+        views = (*self.train_views, *self.test_views)
+        first = views[0].camera if views else None
+        facts = {
+            "training views": len(self.train_views),
+            "held out": len(self.test_views),
+            "pixels": f"{first.width} x {first.height}" if first else "",
+            "points": f"{len(self.points):,}",
+            **{f"note {i}": note for i, note in enumerate(self.notes, 1)},
+        }
+        shown = views[:: max(1, len(views) // THUMBNAILS)][:THUMBNAILS]
+        return table(self.name, facts, [view.image for view in shown])
 
 
 def scene_extent(centers: np.ndarray) -> float:  # centers: [V, 3]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from compgs.errors import CompGSError, ConfigError
 from compgs.evaluation.reports.tables import Table
+from compgs.occupied import occupied
 from compgs.suites.cluster import Needs, check_ray, run_on_cluster
 from compgs.suites.jobs import Job, Outcome, check_scenes, jobs_of
 from compgs.suites.results import write_results
@@ -48,7 +49,22 @@ def benchmark(
     check_scenes(chosen, data_folder)
     if cluster is not None:
         check_ray()
-    jobs = jobs_of(chosen, data_folder, folder)
+    with occupied(folder):
+        return _benchmark(
+            chosen, notes, jobs_of(chosen, data_folder, folder), folder, cluster, needs, progress
+        )
+
+
+def _benchmark(
+    suite: Suite,
+    notes: list[str],
+    jobs: Sequence[Job],
+    folder: Path,
+    cluster: str | None,
+    needs: Needs | None,
+    progress: Callable[[int, int, str], None] | None,
+) -> Benchmark:
+    """Run the jobs in a folder that is this process's until the end."""
     outcomes: list[Outcome] = []
     show = progress or (lambda done, total, what: None)
     show(0, len(jobs), "")
@@ -64,7 +80,7 @@ def benchmark(
         show(len(outcomes), len(jobs), in_words(outcome.job))
     failed = tuple(outcome for outcome in outcomes if outcome.error)
     notes += [f"{in_words(outcome.job)} failed: {outcome.error}" for outcome in failed]
-    tables, files = write_results(chosen, jobs, folder, notes)
+    tables, files = write_results(suite, jobs, folder, notes)
     return Benchmark(tuple(tables), tuple(files), failed, len(jobs))
 
 

@@ -36,7 +36,7 @@ CPU = torch.device("cpu")
 GPU_BLOCK = 1 << 18  # anchors: a GPU is not busy with fewer
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class HybridOnDevice(HybridModel):
     """A hybrid scene that torch predicts and draws."""
 
@@ -192,7 +192,7 @@ class HybridOnDevice(HybridModel):
         return index, found.opacities, found.colors
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SplatsOnDevice(SplatModel):
     """Splats that torch activates and draws."""
 

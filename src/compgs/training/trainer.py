@@ -99,7 +99,7 @@ def train(
     preset: str | None = None,
     output: str | Path | None = None,
     resume: bool = False,
-    on_progress: Callable[[TrainingStatus], None] | None = None,
+    progress: Callable[[TrainingStatus], None] | None = None,
     device: str | torch.device | None = None,
     profile: StepProfile | None = None,
 ) -> TrainedModel:
@@ -113,7 +113,7 @@ def train(
     Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
     """
     config = chosen_config(config, preset)
-    run = Run(METHOD, output=output, resume=resume, on_progress=on_progress, device=device, profile=profile)
+    run = Run(METHOD, output=output, resume=resume, on_progress=progress, device=device, profile=profile)
     return train_hybrid(as_scene(scene), config, run)
 
 
@@ -405,6 +405,11 @@ class Trainer:
         self.rate = self.target_size.follow(self.rate, self.step)
         self.choose_head_bits()
 
+    def pass_over(self, steps: int) -> None:
+        """Go on by so many steps without learning in them; what is due after each is done."""
+        for _ in range(steps):
+            self.finish_step()
+
     def choose_head_bits(self) -> None:
         """Choose the bits of the heads' weights, as long as the networks do not compute with weights so rounded."""
         if not self.stored:
@@ -517,6 +522,11 @@ class Trainer:
         check_points_seen(self.scene, self.settings.near_plane)
         self.check_ranks()
         run_to_end(self, self.config.training, path, on_progress, watch)
+
+    def camera_at(self, step: int, divisor: int = 1) -> Camera:
+        """Return the camera of a usual training view, as large as a step looks at it."""
+        cameras = [view.camera for view in self.scene.train_views]
+        return self.coarse.usual(cameras, step / self.config.training.steps, divisor)
 
     def snapshot(self) -> HybridModel:
         """What the file would hold of the scene now; the end of the run takes means, and removes primitives."""

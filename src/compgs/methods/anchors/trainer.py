@@ -40,6 +40,7 @@ from compgs.training.run.restoring import (
     restoring,
 )
 from compgs.training.run.seen_points import check_points_seen
+from compgs.training.shortcuts.coarse import usual_camera
 from compgs.training.step.views_in_turn import ViewsInTurn
 from compgs.training.structure.control import AdaptiveControl, make_schedule
 from compgs.training.trainer import stations, vanishing_loss
@@ -207,6 +208,11 @@ class AnchorTrainer:
         """All remaining steps."""
         check_points_seen(self.scene, self.settings.near_plane)
         run_to_end(self, self.config.training, run.checkpoint, run.on_progress, run.watch)
+
+    def camera_at(self, step: int, divisor: int = 1) -> Camera:
+        """Return the camera of a usual training view, as large as a step looks at it."""
+        camera = usual_camera([view.camera for view in self.scene.train_views], divisor)
+        return camera
 
     def snapshot(self) -> Renderable:
         return self.model.as_hybrid_model()

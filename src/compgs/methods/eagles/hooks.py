@@ -131,12 +131,15 @@ class Latents(Hooks):
     def view(self, camera: Camera, photograph: Target, trainer: SplatTrainer) -> tuple[Camera, Target]:
         """A smaller image in the first part of the run."""
         self.follow_decoders(trainer)
-        e = self.config.eagles
-        scale = image_scale(trainer.progress, e.smallest_image, e.coarse_until)
-        width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
-        if (width, height) == (camera.width, camera.height):
+        small = self.sized(camera, trainer.progress)
+        if (small.width, small.height) == (camera.width, camera.height):
             return camera, photograph
-        return camera.resized(width, height), smaller(photograph, width, height)
+        return small, smaller(photograph, small.width, small.height)
+
+    def sized(self, camera: Camera, progress: float) -> Camera:
+        e = self.config.eagles
+        scale = image_scale(progress, e.smallest_image, e.coarse_until)
+        return camera.resized(*(max(1, round(scale * side)) for side in (camera.width, camera.height)))
 
     def follow_decoders(self, trainer: SplatTrainer) -> None:
         """The latents' learning rates go with the decoders."""

@@ -1,8 +1,8 @@
 """What training is, whatever is trained: steps to the end, progress, checkpoints, a stop at any time."""
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -22,8 +22,9 @@ from compgs.tensors.rasterize import rasterize
 from compgs.training.plan import Plan
 from compgs.training.run.allocation import freed_memory_kept
 from compgs.training.run.checkpoint import CHECKPOINT_NAME, Writer
-from compgs.training.run.distributed import local_device, on_any_rank, rank, stopping_together
+from compgs.training.run.distributed import local_device, on_any_rank, rank, stopping_together, world
 from compgs.training.run.profile import StepProfile
+from compgs.training.run.time_left import TimeLeft
 
 REPORT_EVERY = 10  # steps between two status reports
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it may look at every primitive
@@ -44,6 +45,9 @@ class TrainingStatus:
     lmbda: (
         float | None
     )  # weight of the rate, which follows the size where one is asked for; None: there is no rate
+    seconds_left: float | None = None  # None: the steps that are left, at the present pace
+    # Of the whole run, where the sides of the photographs are divided by so much; empty unless they are large.
+    seconds_by_divisor: Mapping[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,13 @@ class Trains(Protocol):
         """The scene of now, to be rendered: a copy that further steps do not change, taken without any chance."""
         ...
 
+    def camera_at(self, step: int, divisor: int = 1) -> Camera:
+        """Return the camera of a usual training view, as large as a step looks at it.
+
+        The photographs' sides are divided by `divisor`.
+        """
+        ...
+
     def finish(self) -> None: ...
 
     def save(self, path: Path | None, writer: Writer | None = None) -> None:
@@ -166,6 +177,7 @@ class Pace:
 
     def __init__(self) -> None:
         self.seconds = 0.0  # unknown before the second step
+        self._size: object = None
         self._since: float | None = None
         self._steps = 0
 
@@ -176,12 +188,15 @@ class Pace:
         else:
             self._steps += 1
 
-    def look(self) -> float:
-        """Seconds per step, smoothed; the mean is forgotten when steps become twice as fast, as after compiling."""
+    def look(self, size: object = None) -> float:
+        """Seconds per step, smoothed; the mean is forgotten when steps become twice as fast, as after compiling, or
+        look at pictures of another size.
+        """
         now = time.perf_counter()
         if self._since is not None and self._steps:
             recent = (now - self._since) / self._steps
-            steady = self.seconds and recent >= 0.5 * self.seconds
+            steady = self.seconds and size == self._size and recent >= 0.5 * self.seconds
+            self._size = size
             self.seconds = 0.9 * self.seconds + 0.1 * recent if steady else recent
             self._since, self._steps = now, 0
         return self.seconds
@@ -266,6 +281,7 @@ def run_to_end(
     if rank() > 0:
         path, on_progress, watch = None, None, None
     saving, pace, estimate = Saving(trainer, path, config.checkpoint_minutes), Pace(), 0
+    left = TimeLeft(trainer, config.steps, -(-config.views_per_step // world()))
     try:
         while trainer.step < config.steps:
             with stopping_together():
@@ -280,10 +296,11 @@ def run_to_end(
                 if saves:
                     pace.pause(saving.begin())
                 if on_progress and told:
-                    seconds = pace.look()
+                    seconds = pace.look(left.size)
+                    pace.pause(left.look(seconds))
                     if trainer.step % ESTIMATE_EVERY == 0 or not estimate:
                         estimate = trainer.estimated_bytes()
-                    on_progress(_status(trainer, config.steps, result, estimate, seconds))
+                    on_progress(_status(trainer, config.steps, result, estimate, seconds, left))
                 if watch:
                     watch(trainer)
         with stopping_together():
@@ -294,7 +311,9 @@ def run_to_end(
     saving.last()
 
 
-def _status(trainer: Trains, steps: int, result: StepResult, estimate: int, pace: float) -> TrainingStatus:
+def _status(
+    trainer: Trains, steps: int, result: StepResult, estimate: int, pace: float, left: TimeLeft
+) -> TrainingStatus:
     photograph, counted = result.photograph.image.to(result.image.dtype) / 255.0, result.photograph.counted
     image = exposed(result.image, result.photograph.exposure).detach()
     squares = (image.clamp(0, 1) - photograph) ** 2
@@ -310,4 +329,6 @@ def _status(trainer: Trains, steps: int, result: StepResult, estimate: int, pace
         estimated_bytes=estimate,
         seconds_per_step=pace,
         lmbda=trainer.lmbda,
+        seconds_left=left.seconds(),
+        seconds_by_divisor=left.by_divisor(),
     )

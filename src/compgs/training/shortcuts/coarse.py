@@ -7,6 +7,7 @@ bytes, at 960 x 717 four tenths less (docs/results/tried.md).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -37,6 +38,15 @@ def halved(camera: Camera, times: int) -> Camera:
     return camera.resized(*(max(1, round(side / 2**times)) for side in (camera.width, camera.height)))
 
 
+def usual_camera(cameras: Sequence[Camera], divisor: int = 1) -> Camera:
+    """One of the middle one's size, with sides divided by so much."""
+    by_size = sorted(range(len(cameras)), key=lambda i: cameras[i].width * cameras[i].height)
+    camera = cameras[by_size[len(by_size) // 2]]
+    if divisor == 1:
+        return camera
+    return camera.resized(*(max(1, side // divisor) for side in (camera.width, camera.height)))
+
+
 class CoarseViews:
     """The training views as a step looks at them: camera, and what to compare its image with."""
 
@@ -44,6 +54,11 @@ class CoarseViews:
         self.views = views
         self.until = until  # of the run
         self.kept: dict[tuple[int, int], tuple[Camera, Target]] = {}
+
+    def usual(self, cameras: Sequence[Camera], progress: float, divisor: int = 1) -> Camera:
+        """The camera of a view of the usual size as a step looks at it; with sides divided by so much."""
+        camera = usual_camera(cameras, divisor)
+        return halved(camera, halvings(progress, self.until, camera.width, camera.height))
 
     def look(self, view: int, camera: Camera, progress: float) -> tuple[Camera, Target]:
         """Return camera and target at a `progress` of the run, 0 to 1; the target has the view's exposure where

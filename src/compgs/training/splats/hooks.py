@@ -55,6 +55,10 @@ class Hooks(nn.Module):
         """What this step looks at: the view as it is, a smaller one, another picture of it."""
         return camera, photograph
 
+    def sized(self, camera: Camera, progress: float) -> Camera:
+        """Make a camera as large as `view` does at a `progress` of the run, 0 to 1."""
+        return camera
+
     def transform(self, splats: Splats, trainer: "SplatTrainer") -> Splats:
         """The splats as they are drawn, differentiable: quantized, masked, decoded. Density control judges these."""
         return splats

@@ -93,6 +93,9 @@ def _of_whole(
         return None
 
     def show_whole(status: TrainingStatus) -> None:
-        show(replace(status, step=before + status.step, steps=total))
+        # Later phases at the present pace.
+        later = (total - before - status.steps) * status.seconds_per_step
+        left = None if status.seconds_left is None else status.seconds_left + later
+        show(replace(status, step=before + status.step, steps=total, seconds_left=left))
 
     return show_whole

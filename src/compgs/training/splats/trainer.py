@@ -53,6 +53,7 @@ from compgs.training.run.restoring import (
     restoring,
 )
 from compgs.training.run.seen_points import check_points_seen
+from compgs.training.shortcuts.coarse import usual_camera
 from compgs.training.splats.densification import DensityControl, densify_schedule
 from compgs.training.splats.hooks import Drawn, Hooks, hook_state, parameter_groups, restore_hooks
 from compgs.training.splats.parameters import (
@@ -79,7 +80,7 @@ def train_splats(
     preset: str | None = None,
     output: str | Path | None = None,
     resume: bool = False,
-    on_progress: Callable[[TrainingStatus], None] | None = None,
+    progress: Callable[[TrainingStatus], None] | None = None,
     device: str | torch.device | None = None,
     profile: StepProfile | None = None,
 ) -> SplatModel:
@@ -92,7 +93,7 @@ def train_splats(
     from compgs.training.splats.phases import Phase, train_phases
 
     config = chosen_config(config, preset)
-    run = Run(METHOD, output=output, resume=resume, on_progress=on_progress, device=device, profile=profile)
+    run = Run(METHOD, output=output, resume=resume, on_progress=progress, device=device, profile=profile)
     return train_phases(as_scene(scene), (Phase(config),), run).model()
 
 
@@ -296,6 +297,11 @@ class SplatTrainer:
     def finish(self) -> None:
         """Plain 3DGS has nothing left to do: the file holds the splats as they are."""
         self.hooks.finish(self)
+
+    def camera_at(self, step: int, divisor: int = 1) -> Camera:
+        """Return the camera of a usual training view, as large as a step looks at it."""
+        camera = usual_camera([view.camera for view in self.scene.train_views], divisor)
+        return self.hooks.sized(camera, step / self.config.training.steps)
 
     def snapshot(self) -> SplatModel:
         """Return the splats before any `transform`, for which a hook may draw random numbers."""
