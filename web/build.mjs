@@ -4,7 +4,7 @@
  * Needs only the packages of package-lock.json, and gives the same bytes wherever it runs.
  */
 
-import { readFile, writeFile } from "node:fs/promises";
+import { readFile, rm, writeFile } from "node:fs/promises";
 import { resolve } from "node:path";
 import { fileURLToPath } from "node:url";
 import asc from "assemblyscript/asc";
@@ -59,21 +59,43 @@ async function bundled(entry, options = {}) {
   return outputFiles[0].text;
 }
 
-const worker = await bundled("viewer/worker.ts");
-const embedWorker = {
-  name: "worker",
-  setup({ onResolve, onLoad }) {
-    onResolve({ filter: /^compgs:worker$/ }, () => ({ path: "worker", namespace: "embedded" }));
-    onLoad({ filter: /.*/, namespace: "embedded" }, () => ({ contents: worker, loader: "text" }));
-  },
-};
+/** Makes the bundled text of a program a module of the name that it is imported by. */
+async function embedded(name, entry) {
+  const contents = await bundled(entry);
+  return {
+    name,
+    setup({ onResolve, onLoad }) {
+      onResolve({ filter: new RegExp(`^${name}$`) }, () => ({ path: name, namespace: name }));
+      onLoad({ filter: /.*/, namespace: name }, () => ({ contents, loader: "text" }));
+    },
+  };
+}
 
-await build({ ...shared, entryPoints: ["src/index.ts"], outfile: `${folder}/compgs.js` });
+const embedWorker = await embedded("compgs:worker", "viewer/worker.ts");
+const embedLiveWorker = await embedded("compgs:live-worker", "src/live/worker.ts");
+
+// Modules of one package: what several of them have is in a file that they share. Those of earlier builds have other names.
+await rm(`${folder}/parts`, { recursive: true, force: true });
 await build({
   ...shared,
-  entryPoints: ["viewer/viewer.ts"],
-  outfile: `${folder}/viewer.js`,
-  plugins: [embedKernels, embedWorker],
+  entryPoints: {
+    compgs: "src/index.ts",
+    viewer: "viewer/viewer.ts",
+    live: "src/live/index.ts",
+    spark: "engines/spark.ts",
+    playcanvas: "engines/playcanvas.ts",
+  },
+  outdir: folder,
+  splitting: true,
+  chunkNames: "parts/[hash]",
+  plugins: [embedKernels, embedWorker, embedLiveWorker],
+  external: ["three", "@sparkjsdev/spark", "playcanvas"],
+});
+await build({
+  ...shared,
+  entryPoints: ["src/live/worker.ts"],
+  outfile: `${folder}/worker.js`,
+  format: "iife",
 });
 
 const script = await bundled("viewer/page.ts", { plugins: [embedKernels, embedWorker] });

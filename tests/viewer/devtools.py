@@ -85,7 +85,9 @@ def tab(browser: str, folder: Path, width: int, height: int) -> Iterator[Page]:
         port = _debugging_port(folder / "DevToolsActivePort", process)
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=MAX_SECONDS) as answer:
             (target,) = [each for each in json.load(answer) if each["type"] == "page"]
-        with connect(target["webSocketDebuggerUrl"], max_size=None, proxy=None) as socket:
+        # A browser that draws by software on a busy machine answers late.
+        address = target["webSocketDebuggerUrl"]
+        with connect(address, max_size=None, proxy=None, ping_interval=None) as socket:
             page = Page(socket)
             page.call(
                 "Emulation.setDeviceMetricsOverride",

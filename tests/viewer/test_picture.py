@@ -51,12 +51,12 @@ def cameras_around(content: FileContent) -> list[Camera]:
     """Beside the scene, within it, and beside it in a small picture; their principal points are off the middle."""
     middle = content.coordinates.mean(0) * content.voxel_size + np.array(content.world_offset)
     extent = float(np.ptp(content.coordinates, axis=0).max()) * content.voxel_size
-    beside = _looking(middle + extent * np.array((0.4, -0.5, -1.1)), middle)
-    within = _looking(middle + extent * np.array((0.05, 0.1, 0.0)), middle + extent)
+    beside = looking(middle + extent * np.array((0.4, -0.5, -1.1)), middle)
+    within = looking(middle + extent * np.array((0.05, 0.1, 0.0)), middle + extent)
     return [beside, within, beside.resized(40, 28)]
 
 
-def _looking(centre: np.ndarray, target: np.ndarray) -> Camera:
+def looking(centre: np.ndarray, target: np.ndarray) -> Camera:
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, (0.0, -1.0, 0.0))
     right /= np.linalg.norm(right)

@@ -1,9 +1,13 @@
 /** Bytes of a .cgs file to a scene. */
 
+import { chooseKernels } from "./choose_kernels.ts";
 import { unpack, SectionNumber } from "./codec/container.ts";
 import type { Kernels } from "./codec/kernels.ts";
 import { plainKernels } from "./codec/plain_kernels.ts";
-import { type Scene, SceneDecoder } from "./codec/scene_decoder.ts";
+import { SceneDecoder } from "./codec/scene_decoder.ts";
+import { type DecodedScene, withSplats } from "./decoded_scene.ts";
+import { ProgressiveDecoder } from "./progressive.ts";
+import { type ByteStream, piecesOf } from "./sources.ts";
 
 export interface DecodeOptions {
   /**
@@ -15,15 +19,35 @@ export interface DecodeOptions {
   kernels?: Kernels;
 }
 
+export interface StreamOptions {
+  /** The loops that take the time; WebAssembly where there is some, unless given. */
+  kernels?: Kernels;
+  /** Is called with each finer scene while bytes arrive. */
+  onScene?: (scene: DecodedScene) => void;
+}
+
 /**
- * The scene in a .cgs file (docs/bitstream.md): the same integers as on every other machine.
+ * The scene in a .cgs file (docs/bitstream.md): the same integers as on every other machine. Of bytes at once, of a
+ * stream, a response or a blob when all of it has arrived.
  *
- * Throws NotACompGSFile, UnsupportedVersion, TruncatedSection or CorruptSection.
+ * Throws, or rejects with, NotACompGSFile, UnsupportedVersion, TruncatedSection or CorruptSection.
  */
-export function decode(data: ArrayBuffer | Uint8Array, options: DecodeOptions = {}): Scene {
-  const { prefix = false, kernels = plainKernels } = options;
-  let bytes = data instanceof Uint8Array ? data : new Uint8Array(data);
-  if (typeof prefix === "number") bytes = bytes.subarray(0, Math.max(0, prefix));
+export function decode(data: ArrayBuffer | Uint8Array, options?: DecodeOptions): DecodedScene;
+export function decode(stream: ByteStream, options?: StreamOptions): Promise<DecodedScene>;
+export function decode(
+  source: ArrayBuffer | Uint8Array | ByteStream,
+  options: DecodeOptions & StreamOptions = {},
+): DecodedScene | Promise<DecodedScene> {
+  if (source instanceof Uint8Array) return decodeBytes(source, options);
+  if (source instanceof ArrayBuffer) return decodeBytes(new Uint8Array(source), options);
+  return decodeStream(source, options);
+}
+
+function decodeBytes(
+  data: Uint8Array,
+  { prefix = false, kernels = plainKernels }: DecodeOptions,
+): DecodedScene {
+  const bytes = typeof prefix === "number" ? data.subarray(0, Math.max(0, prefix)) : data;
   const isPrefix = prefix !== false;
   const { version, sections, hasAllLatents } = unpack(bytes, isPrefix);
   const decoder = new SceneDecoder(version, sections, kernels, bytes.length, !isPrefix);
@@ -31,5 +55,15 @@ export function decode(data: ArrayBuffer | Uint8Array, options: DecodeOptions = 
     if (section.number === SectionNumber.latents) decoder.addRange(section, bytes.length);
   }
   if (hasAllLatents) decoder.checkComplete();
-  return decoder.scene();
+  return withSplats(decoder.scene(), kernels);
+}
+
+async function decodeStream(stream: ByteStream, options: StreamOptions): Promise<DecodedScene> {
+  const kernels = options.kernels ?? (await chooseKernels());
+  const decoder = new ProgressiveDecoder(kernels);
+  for await (const piece of piecesOf(stream)) {
+    if (decoder.push(piece)) options.onScene?.(withSplats(decoder.scene(), kernels));
+  }
+  decoder.finish();
+  return withSplats(decoder.scene(), kernels);
 }

@@ -23,9 +23,17 @@ export interface Gaussians {
  * depend on the camera.
  */
 export function gaussians(scene: Scene, camera: Pick<Camera, "worldToCamera">, kernels?: Kernels): Gaussians {
-  const predictor = new Predictor(scene, kernels);
+  return gaussiansOf(new Predictor(scene, kernels), scene.worldOffset, camera);
+}
+
+/** What a camera sees of a scene whose geometry is there. */
+export function gaussiansOf(
+  predictor: Predictor,
+  worldOffset: ArrayLike<number>,
+  camera: Pick<Camera, "worldToCamera">,
+): Gaussians {
   const appearance = predictor.newAppearance();
-  const centre = cameraCentre(camera).map((x, axis) => x - scene.worldOffset[axis]!);
+  const centre = cameraCentre(camera).map((x, axis) => x - worldOffset[axis]!);
   predictor.predictAppearance(centre, appearance);
   const { means, quaternions, scales, sound } = predictor.geometry;
   const drawn: number[] = [];

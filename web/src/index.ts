@@ -1,6 +1,9 @@
 /** Decoder of .cgs files: 3D Gaussian scenes in a few kilobytes. */
 
-export { decode, type DecodeOptions } from "./decode.ts";
+export { decode, type DecodeOptions, type StreamOptions } from "./decode.ts";
+export type { DecodedScene } from "./decoded_scene.ts";
+export { type ByteStream, MEDIA_TYPE, type Source, isCgs } from "./sources.ts";
+export { chooseKernels } from "./choose_kernels.ts";
 export type { Scene, SceneGroup } from "./codec/scene_decoder.ts";
 export type { Kernels } from "./codec/kernels.ts";
 export { plainKernels } from "./codec/plain_kernels.ts";
@@ -11,3 +14,5 @@ export { gaussians, type Gaussians } from "./gaussians.ts";
 export { Predictor, type Appearance, type Geometry } from "./prediction/predictor.ts";
 export { type Camera, cameraCentre, poseOf } from "./cameras.ts";
 export { ProgressiveDecoder } from "./progressive.ts";
+export { type SceneInfo, sceneInfo } from "./scene_info.ts";
+export { splatBudget } from "./budget.ts";

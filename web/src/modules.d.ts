@@ -13,3 +13,8 @@ declare module "compgs:worker" {
   const source: string;
   export default source;
 }
+/** The program of a live scene's worker, bundled by the build. */
+declare module "compgs:live-worker" {
+  const source: string;
+  export default source;
+}

@@ -1,12 +1,22 @@
 /** A scene from the bytes of a file as they arrive: coarse first, finer with each range that is complete. */
 
-import { type Header, type Section, SectionNumber, readHeader, unpackSection } from "./codec/container.ts";
+import {
+  type Header,
+  type Section,
+  type SectionEntry,
+  SectionNumber,
+  readHeader,
+  unpackSection,
+} from "./codec/container.ts";
+import { FieldReader } from "./codec/fields.ts";
 import type { Kernels } from "./codec/kernels.ts";
+import { readRangeHead } from "./codec/latents.ts";
 import { plainKernels } from "./codec/plain_kernels.ts";
 import { type Scene, SceneDecoder } from "./codec/scene_decoder.ts";
 import { CorruptSection, TruncatedSection } from "./errors.ts";
 
 const MAX_HEADER_BYTES = 7 + 255 * 9 + 4;
+const MAX_RANGE_HEAD_BYTES = 3 * 9;
 
 export class ProgressiveDecoder {
   private bytes = new Uint8Array(1 << 16);
@@ -17,7 +27,14 @@ export class ProgressiveDecoder {
   private next = 0;
   private decoder: SceneDecoder | null = null;
 
-  constructor(private readonly kernels: Kernels = plainKernels) {}
+  /** A finer scene would have more primitives than are wanted: nothing that is still to come is needed. */
+  isFull = false;
+
+  /** `most`: coupled primitives that are wanted. The coarsest scene of a file is there even if it has more. */
+  constructor(
+    private readonly kernels: Kernels = plainKernels,
+    private readonly most = Infinity,
+  ) {}
 
   /** Bytes of the whole file as its header has it, or null before the header is there. */
   get expectedBytes(): number | null {
@@ -27,12 +44,15 @@ export class ProgressiveDecoder {
 
   /** Takes more of the file. True if a finer scene can be had. Throws as `decode` does. */
   push(chunk: Uint8Array): boolean {
+    if (this.isFull) return false;
     this.append(chunk);
     if (!this.header && !this.tryHeader(false)) return false;
     const { entries } = this.header!;
     let isFiner = false;
     for (; this.next < entries.length; this.next++) {
       const entry = entries[this.next]!;
+      this.isFull = this.isTooMuch(entry);
+      if (this.isFull) break;
       if (entry.start + entry.length > this.length) break;
       isFiner = this.take(unpackSection(this.bytes.subarray(0, this.length), entry)) || isFiner;
     }
@@ -41,6 +61,7 @@ export class ProgressiveDecoder {
 
   /** Says that all bytes are there; throws if they are not the whole of a file. */
   finish(): void {
+    if (this.isFull) return;
     if (!this.header) this.tryHeader(true);
     const missing = this.header!.entries[this.next];
     if (missing) {
@@ -56,6 +77,21 @@ export class ProgressiveDecoder {
   /** The scene of all ranges that are there. */
   scene(): Scene {
     return this.decoder!.scene();
+  }
+
+  /** Whether a range is known to have more primitives than are wanted. Its first bytes say how many it has. */
+  private isTooMuch({ number, name, start, length }: SectionEntry): boolean {
+    if (number !== SectionNumber.latents || !this.decoder) return false;
+    const head = this.bytes.subarray(
+      start,
+      Math.min(start + MAX_RANGE_HEAD_BYTES, start + length, this.length),
+    );
+    if (head.length < Math.min(MAX_RANGE_HEAD_BYTES, length)) return false;
+    try {
+      return this.decoder.coupled + readRangeHead(new FieldReader(head, name)).coupled > this.most;
+    } catch {
+      return false; // a damaged range is refused when all of it is there
+    }
   }
 
   private append(chunk: Uint8Array): void {

@@ -60,3 +60,31 @@ test("damaged files are refused in pieces, too", () => {
     else assert.throws(refuse, (thrown) => thrown instanceof compgs.BitstreamError);
   }
 });
+
+test("of a file with more primitives than are wanted, its last range that is not too much is decoded", () => {
+  const { bytes, hashes } = goldenFiles().find(({ name }) => name === "default");
+  const [coarse, middle, whole] = decode(bytes).ranges.map(({ coupled }) => coupled);
+  for (const [most, expected] of [
+    [1, coarse],
+    [coarse + middle - 1, coarse],
+    [coarse + middle, coarse + middle],
+    [coarse + middle + whole - 1, coarse + middle],
+  ]) {
+    const decoder = new ProgressiveDecoder(undefined, most);
+    let [needed, used] = [0, 0];
+    for (const piece of pieces(bytes, 50)) {
+      if (decoder.isFull) break;
+      needed += piece.length;
+      if (decoder.push(piece)) used = needed;
+    }
+    decoder.finish();
+    assert.equal(decoder.scene().coupled, expected);
+    assert.ok(needed - used <= 50); // of the range that is too much only its beginning is read
+    assert.deepEqual(hashesOf(decoder.scene()), hashesOf(decode(bytes, { prefix: used })));
+    assert.equal(decoder.push(bytes.subarray(needed)), false);
+  }
+  const decoder = new ProgressiveDecoder(undefined, coarse + middle + whole);
+  decoder.push(bytes);
+  decoder.finish();
+  assert.deepEqual(hashesOf(decoder.scene()), hashes);
+});

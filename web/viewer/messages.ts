@@ -1,6 +1,6 @@
 /** What page and worker say to each other. Everything is in the local frame of the scene. */
 
-import type { Viewpoints } from "../src/codec/viewpoints.ts";
+import type { SceneInfo } from "../src/scene_info.ts";
 import type { FirstView } from "./first_view.ts";
 import type { Vector } from "./pose.ts";
 
@@ -14,27 +14,14 @@ export interface Eye {
 }
 
 export type ToWorker =
-  | { kind: "bytes"; bytes: ArrayBuffer }
-  | { kind: "url"; url: string }
+  /** `most`: splats that are wanted; finer parts of the file that would be more are left out. */
+  | { kind: "bytes"; bytes: ArrayBuffer; most: number }
+  | { kind: "url"; url: string; most: number }
   | { kind: "eye"; eye: Eye }
   /** What is along this ray? `direction` has length one; `pixel`: angle of a pixel, radians. */
   | { kind: "pick"; id: number; origin: Vector; direction: Vector; pixel: number }
   /** The renderer is a new one, and has nothing of the scene. */
   | { kind: "again" };
-
-/** What the page shows about a scene, and what a camera starts from. */
-export interface SceneInfo {
-  anchors: number;
-  totalAnchors: number;
-  coupled: number;
-  background: [number, number, number];
-  angularDilation: number | null;
-  worldOffset: [number, number, number];
-  viewpoints: Viewpoints | null;
-  /** Middle and half extent of most anchors. */
-  middle: [number, number, number];
-  extent: number;
-}
 
 export type FromWorker =
   | { kind: "progress"; loaded: number; total: number | null }

@@ -1,7 +1,7 @@
 /** The page: a scene that is embedded in it, named by ?url=, chosen, or dropped onto it. */
 
+import type { SceneInfo } from "../src/scene_info.ts";
 import { whatItIs } from "./kinds.ts";
-import type { SceneInfo } from "./messages.ts";
 import type { RendererName } from "./renderer.ts";
 import { Viewer } from "./viewer.ts";
 

@@ -19,6 +19,9 @@ export const MOST_ALPHA = 0.999;
 export const MARGIN = 0.15;
 
 /** What is added to the variances in a camera's picture, in its pixels^2. */
-export function dilationOf(angularDilation: number | null, { fx, fy }: FrameCamera): number {
+export function dilationOf(
+  angularDilation: number | null,
+  { fx, fy }: Pick<FrameCamera, "fx" | "fy">,
+): number {
   return angularDilation === null ? DILATION : Math.max(LEAST_DILATION, angularDilation * fx * fy);
 }

@@ -1,18 +1,23 @@
 /** A scene in an element of a page: decodes in a worker, draws with WebGPU or WebGL2, follows mouse, touch and keys. */
 
+import { splatBudget } from "../src/budget.ts";
 import type { Camera } from "../src/cameras.ts";
+import type { SceneInfo } from "../src/scene_info.ts";
 import { chooseRenderer } from "./choose_renderer.ts";
 import { Controls } from "./controls.ts";
-import type { FromWorker, SceneInfo, ToWorker } from "./messages.ts";
+import type { FromWorker, ToWorker } from "./messages.ts";
 import type { FirstView } from "./first_view.ts";
 import { Pace } from "./pace.ts";
-import { Pose, type Vector, add, dot, unit } from "./pose.ts";
+import { type Vector, add, unit } from "./pose.ts";
 import type { FrameCamera, Renderer, RendererName } from "./renderer.ts";
+import { FIELD_OF_VIEW, startOf } from "./start.ts";
 import workerSource from "compgs:worker";
 
 export interface ViewerOptions {
   /** What must draw; else WebGPU where the browser and its device have it, and WebGL2 elsewhere. */
   renderer?: RendererName;
+  /** Splats that are wanted: finer parts of a file that would be more are not fetched. By default `splatBudget()`. */
+  most?: number;
   /** Bytes of the file so far and of all, the latter if it is known. */
   onProgress?: (loaded: number, total: number | null) => void;
   /** A scene is there, or a finer version of it. */
@@ -32,7 +37,6 @@ const REST = 250; // ms without movement, after which the picture becomes sharp
 const MOST_CUT = 1.35; // of a viewpoint's picture, by which it is enlarged to fill a window of another shape
 const LEAST_LENS = 0.2; // of a focal length, as the scene has it
 const MOST_LENS = 5;
-const FIELD_OF_VIEW = 0.9; // radians, of the smaller side, for files without viewpoints
 
 export class Viewer {
   readonly controls: Controls;
@@ -100,12 +104,13 @@ export class Viewer {
     this.controls.target = null;
     this.fixed = null;
     this.isTouched = false;
+    const most = this.options.most ?? splatBudget();
     if (typeof source === "string") {
-      this.send({ kind: "url", url: new URL(source, document.baseURI).href });
+      this.send({ kind: "url", url: new URL(source, document.baseURI).href, most });
       return;
     }
     const bytes = source instanceof Uint8Array ? source.slice().buffer : source.slice(0);
-    this.send({ kind: "bytes", bytes: bytes as ArrayBuffer }, [bytes]);
+    this.send({ kind: "bytes", bytes: bytes as ArrayBuffer, most }, [bytes]);
   }
 
   dispose(): void {
@@ -425,18 +430,4 @@ function inFrame({ worldToCamera: m, fx, fy, cx, cy }: Camera, offset: ArrayLike
     return m[4 * row + 3]! + turned;
   });
   return { rotation, translation, fx, fy, cx, cy };
-}
-
-function startOf(info: SceneInfo, view: number): { pose: Pose; up: Vector; distance: number } {
-  const { middle, extent, viewpoints } = info;
-  const start = viewpoints?.views[view];
-  if (viewpoints && start) {
-    const pose = Pose.of([...start.position], start.rotation);
-    const depth = dot(pose.forward, add(middle, pose.centre, -1));
-    return { pose, up: viewpoints.up, distance: Math.max(depth, 0.1 * extent) };
-  }
-  const up: Vector = [0, -1, 0];
-  const distance = (2.5 * extent) / Math.tan(FIELD_OF_VIEW / 2);
-  const centre = add(add(middle, [0, 0, -1], distance), up, 0.3 * distance);
-  return { pose: Pose.lookingAt(centre, middle, up), up, distance };
 }

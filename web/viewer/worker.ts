@@ -1,13 +1,14 @@
 /** The worker: decodes a file as it arrives, predicts its splats, and sorts them for the camera at hand. */
 
+import { chooseKernels } from "../src/choose_kernels.ts";
 import type { Kernels } from "../src/codec/kernels.ts";
 import type { Scene } from "../src/codec/scene_decoder.ts";
 import { type Appearance, OPACITY_CUTOFF, Predictor } from "../src/prediction/predictor.ts";
 import { ProgressiveDecoder } from "../src/progressive.ts";
-import { chooseKernels } from "./choose_kernels.ts";
+import { sceneInfo } from "../src/scene_info.ts";
 import { DepthOrder } from "./depth_order.ts";
 import { firstView } from "./first_view.ts";
-import type { Eye, FromWorker, SceneInfo, ToWorker } from "./messages.ts";
+import type { Eye, FromWorker, ToWorker } from "./messages.ts";
 import { distanceAlong } from "./pick.ts";
 import { appearanceRows, geometryPlanes, rowsOf } from "./splat_planes.ts";
 import { NEAR } from "./splatting.ts";
@@ -41,8 +42,8 @@ let isScheduled = false;
 let opened = 0;
 
 self.onmessage = ({ data }) => {
-  if (data.kind === "bytes") void open(++opened, streamOf(new Uint8Array(data.bytes)), data.bytes.byteLength);
-  else if (data.kind === "url") void openUrl(++opened, data.url);
+  if (data.kind === "bytes") openBytes(data.bytes, data.most);
+  else if (data.kind === "url") void openUrl(++opened, data.url, data.most);
   else if (data.kind === "eye") setEye(data.eye);
   else if (data.kind === "pick") pick(data);
   else if (shown) present(shown);
@@ -63,7 +64,11 @@ function setEye(next: Eye): void {
   schedule();
 }
 
-async function openUrl(ticket: number, url: string): Promise<void> {
+function openBytes(bytes: ArrayBuffer, most: number): void {
+  void open(++opened, streamOf(new Uint8Array(bytes)), bytes.byteLength, most);
+}
+
+async function openUrl(ticket: number, url: string, most: number): Promise<void> {
   try {
     const response = await fetch(url).catch((error: Error) => {
       throw new Error(
@@ -72,7 +77,7 @@ async function openUrl(ticket: number, url: string): Promise<void> {
     });
     if (!response.ok) throw new Error(`${url}: the server answers ${response.status} ${response.statusText}`);
     const length = Number(response.headers.get("Content-Length")) || null;
-    await open(ticket, response.body!, response.headers.get("Content-Encoding") ? null : length);
+    await open(ticket, response.body!, response.headers.get("Content-Encoding") ? null : length, most);
   } catch (error) {
     report(ticket, error, NO_BYTES);
   }
@@ -87,11 +92,16 @@ function streamOf(bytes: Uint8Array): ReadableStream<Uint8Array> {
   });
 }
 
-async function open(ticket: number, stream: ReadableStream<Uint8Array>, total: number | null): Promise<void> {
+async function open(
+  ticket: number,
+  stream: ReadableStream<Uint8Array>,
+  total: number | null,
+  most: number,
+): Promise<void> {
   let head = NO_BYTES;
   try {
     const chosen = await kernels;
-    const decoder = new ProgressiveDecoder(chosen);
+    const decoder = new ProgressiveDecoder(chosen, most);
     const reader = stream.getReader();
     let loaded = 0;
     for (;;) {
@@ -103,6 +113,10 @@ async function open(ticket: number, stream: ReadableStream<Uint8Array>, total: n
       const isFiner = decoder.push(value);
       self.postMessage({ kind: "progress", loaded, total: total ?? decoder.expectedBytes });
       if (isFiner) show(decoder.scene(), chosen);
+      if (decoder.isFull) {
+        void reader.cancel().catch(() => {}); // nothing that is still to come is shown
+        break;
+      }
     }
     decoder.finish();
     self.postMessage({ kind: "complete", bytes: loaded });
@@ -120,7 +134,7 @@ function report(ticket: number, error: unknown, head: Uint8Array): void {
 function show(scene: Scene, chosen: Kernels): void {
   const predictor = new Predictor(scene, chosen);
   shown = { predictor, appearance: predictor.newAppearance(), nextAnchor: 0, remaining: 0 };
-  const info = infoOf(scene, predictor);
+  const info = sceneInfo(scene, predictor);
   const first = firstView(predictor.positions, info.viewpoints, info.extent);
   self.postMessage({ kind: "scene", info, first });
   present(shown);
@@ -137,28 +151,6 @@ function present(scene: Shown): void {
   const frame = eye && frameOf(scene, eye, Infinity);
   self.postMessage({ kind: "geometry", planes, rows }, [planes.buffer]);
   if (frame) post(frame);
-}
-
-function infoOf(scene: Scene, { positions }: Predictor): SceneInfo {
-  const range = [0, 1, 2].map((axis) => {
-    const sorted = Float32Array.from({ length: scene.anchors }, (_, n) => positions[3 * n + axis]!).sort();
-    const at = (share: number): number => sorted[Math.floor(share * (sorted.length - 1))]!;
-    return { middle: at(0.5), half: (at(0.9) - at(0.1)) / 2 };
-  });
-  const { anchors, totalAnchors, coupled, background, angularDilation, worldOffset, viewpoints } = scene;
-  const middle: [number, number, number] = [range[0]!.middle, range[1]!.middle, range[2]!.middle];
-  const extent = Math.max(...range.map(({ half }) => half), scene.voxelSize);
-  return {
-    anchors,
-    totalAnchors,
-    coupled,
-    background,
-    angularDilation,
-    worldOffset,
-    viewpoints,
-    middle,
-    extent,
-  };
 }
 
 /** One frame at a time, with room for messages in between. */

@@ -37,6 +37,7 @@ export interface Scene {
   coupled: number;
   /** Those of the whole file. */
   totalAnchors: number;
+  totalCoupled: number;
   coupledPrimitives: number;
   residualDim: number;
   referenceDim: number;
@@ -85,7 +86,8 @@ export class SceneDecoder {
   private readonly ranges: RangeHead[] = [];
   private readonly pieces: GroupLatents[][] = [];
   private anchors = 0;
-  private coupled = 0;
+  /** Coupled primitives that are there. */
+  coupled = 0;
   private viewpoints: Viewpoints | null = null;
   private metadata = new Map<string, string>();
 
@@ -217,6 +219,7 @@ export class SceneDecoder {
       anchors,
       coupled: this.coupled,
       totalAnchors: section.anchors,
+      totalCoupled: section.coupled,
       depth: this.depth,
       coordinates: this.coordinates.subarray(0, 3 * anchors),
       mask: this.mask.subarray(0, section.coupledPrimitives * anchors),

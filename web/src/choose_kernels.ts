@@ -1,8 +1,8 @@
 /** WebAssembly where the browser has it, else plain TypeScript. */
 
-import type { Kernels } from "../src/codec/kernels.ts";
-import { plainKernels } from "../src/codec/plain_kernels.ts";
-import { wasmKernels } from "../src/wasm_kernels.ts";
+import type { Kernels } from "./codec/kernels.ts";
+import { plainKernels } from "./codec/plain_kernels.ts";
+import { wasmKernels } from "./wasm_kernels.ts";
 
 export async function chooseKernels(): Promise<Kernels> {
   try {
