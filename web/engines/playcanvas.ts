@@ -7,7 +7,6 @@ import {
   type CameraComponent,
   Color,
   Entity,
-  GSPLATDATA_LARGE,
   type GSplatComponent,
   GSplatContainer,
   GSplatFormat,
@@ -28,6 +27,7 @@ import { NEAR, dilationOf } from "../viewer/splatting.ts";
 import { drawAsTrained, setDilation } from "./playcanvas_splatting.ts";
 import { startCamera } from "./viewpoint.ts";
 
+export { drawAsTrained } from "./playcanvas_splatting.ts";
 export { splatBudget } from "../src/budget.ts";
 export { isCgs, MEDIA_TYPE } from "../src/sources.ts";
 
@@ -238,17 +238,10 @@ export async function loadSplats(app: AppBase, source: Source, options: CgsOptio
 }
 
 /**
- * Puts splats into an application, upright as their file says, and a camera at the file's first viewpoint with the file's background where it has
- * none. Sets the scene's splats to what .cgs files want: sorted by depth, small ones kept, not rounded further, drawn as
- * in training.
+ * Puts splats into an application, upright as their file says and drawn as in training, and a camera at the file's first
+ * viewpoint with the file's background where there is none. Gives the camera.
  */
 export function setStage(app: AppBase, splats: Entity): Entity {
-  const { gsplat } = app.scene;
-  gsplat.antiAlias = false;
-  gsplat.radialSorting = false;
-  gsplat.dataFormat = GSPLATDATA_LARGE;
-  gsplat.minPixelSize = 0;
-  gsplat.minContribution = 0;
   drawAsTrained(app);
   app.root.addChild(splats);
   const { info } = resourceOf(splats);

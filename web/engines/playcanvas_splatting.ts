@@ -1,6 +1,6 @@
 /** PlayCanvas draws splats as .cgs files are trained to be drawn. */
 
-import { type AppBase, SHADERLANGUAGE_GLSL, ShaderChunks } from "playcanvas";
+import { type AppBase, GSPLATDATA_LARGE, SHADERLANGUAGE_GLSL, ShaderChunks } from "playcanvas";
 import { CUTOFF } from "../viewer/splatting.ts";
 
 /** What the engine adds to the variances of splats, and their least, as its shader has it: in half pixels, squared. */
@@ -27,12 +27,19 @@ void modifySplatColor(vec2 gaussianUV, inout vec4 color) {
 `;
 
 /**
- * For all splats of an application. With WebGL2; where the engine draws with WebGPU, its own falloff and dilation, a
+ * Sets the splats of an application to what .cgs files want: sorted by depth, small ones kept, not rounded further, widened
+ * and faded as in training. The latter with WebGL2; where the engine draws with WebGPU, its own falloff and dilation, a
  * quarter of the usual 0.3 pixels^2, stay.
  */
 export function drawAsTrained(app: AppBase): void {
-  const { material } = app.scene.gsplat;
-  const chunks = material.getShaderChunks(SHADERLANGUAGE_GLSL);
+  const { gsplat } = app.scene;
+  gsplat.antiAlias = false;
+  gsplat.radialSorting = false;
+  gsplat.dataFormat = GSPLATDATA_LARGE;
+  gsplat.minPixelSize = 0;
+  gsplat.minContribution = 0;
+  gsplat.alphaClipForward = LEAST_ALPHA;
+  const chunks = gsplat.material.getShaderChunks(SHADERLANGUAGE_GLSL);
   const corner = ShaderChunks.get(app.graphicsDevice, SHADERLANGUAGE_GLSL).get("gsplatCornerVS") ?? "";
   const isKnown = [ENGINE_DILATION, ENGINE_LEAST_VARIANCE, ENGINE_REACH].every((part) => corner.match(part));
   if (isKnown) {
@@ -43,7 +50,6 @@ export function drawAsTrained(app: AppBase): void {
     chunks.set("gsplatCornerVS", `uniform float ${UNIFORM};\n${trained}`);
   } else
     console.warn("compgs: this version of PlayCanvas has another shader: splats are a little too sharp.");
-  app.scene.gsplat.alphaClipForward = LEAST_ALPHA;
   chunks.set("gsplatModifyPS", falloff(isKnown ? REACH : 1));
   setDilation(app, 0.3);
 }
