@@ -64,7 +64,7 @@ def one_size(anchors: int, steps: int, *, encode: bool) -> dict[str, Any]:
         rare: dict[str, tuple[float, float]] = {}
         rare["bounds of culling"] = measured(lambda: (trainer.bounds.forget(), trainer.bounds.radii()))
         rare["estimate of the size"] = measured(trainer.estimated_bytes)
-        each = measured(lambda: trainer.contributions(views))
+        each = measured(lambda: trainer.survey.contributions(views))
         rare["contributions, a view"] = each[0] / views, each[1] / views
         rare["hash of the parameters"] = measured(
             lambda: [digest(tensor) for tensor in trainer.model.state_dict().values()]

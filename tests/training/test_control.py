@@ -38,7 +38,7 @@ def test_growth_never_duplicates_a_position_and_keeps_to_the_limit(blob_scene, t
     before = model.anchors
     control.drawn[:] = 1000
     control.gradient[:] = 1e6
-    control.act(model, trainer.optimizer, trainer.coupled_means() * 1.7 + 0.13, generator, 0.004)
+    control.act(model, trainer.optimizer, trainer.survey.coupled_means() * 1.7 + 0.13, generator, 0.004)
     assert model.anchors > before
     assert len(torch.unique(model.coordinates, dim=0)) == model.anchors
 
@@ -50,7 +50,11 @@ def test_the_number_of_anchors_has_a_limit_that_holds(blob_scene, tiny_config):
     trainer.control.drawn[:] = 1000
     trainer.control.gradient[:] = 1e6
     trainer.control.act(
-        trainer.model, trainer.optimizer, trainer.coupled_means() * 2, torch.Generator().manual_seed(0), 0.004
+        trainer.model,
+        trainer.optimizer,
+        trainer.survey.coupled_means() * 2,
+        torch.Generator().manual_seed(0),
+        0.004,
     )
     assert trainer.model.anchors == limit
 
@@ -68,7 +72,7 @@ def test_transparent_anchors_are_removed_with_their_moments(blob_scene, tiny_con
         name: trainer.optimizer.state[getattr(model, name)]["exp_avg"][~gone]
         for name in model.anchor_parameters
     }
-    means = trainer.coupled_means()
+    means = trainer.survey.coupled_means()
     control.act(model, trainer.optimizer, means, torch.Generator().manual_seed(0), 0.004)
     for name in model.anchor_parameters:
         parameter = getattr(model, name)
@@ -85,7 +89,7 @@ def test_new_anchors_have_no_momentum_and_the_others_keep_theirs(blob_scene, tin
     before = trainer.optimizer.state[model.references]["exp_avg"].clone()
     control.drawn[:] = 1000
     control.gradient[:] = 1e6
-    control.act(model, trainer.optimizer, trainer.coupled_means() * 1.7, torch.Generator(), 0.004)
+    control.act(model, trainer.optimizer, trainer.survey.coupled_means() * 1.7, torch.Generator(), 0.004)
     assert model.anchors > n
     for name in model.anchor_parameters:
         state = trainer.optimizer.state[getattr(model, name)]
@@ -99,7 +103,9 @@ def test_a_scene_whose_anchors_are_all_transparent_keeps_them(blob_scene, tiny_c
     trainer.control.seen[:] = 100
     trainer.control.opacity[:] = 0
     trainer.control.drawn[:] = 0
-    trainer.control.act(trainer.model, trainer.optimizer, trainer.coupled_means(), torch.Generator(), 0.004)
+    trainer.control.act(
+        trainer.model, trainer.optimizer, trainer.survey.coupled_means(), torch.Generator(), 0.004
+    )
     assert trainer.model.anchors == before
 
 

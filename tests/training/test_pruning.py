@@ -77,9 +77,9 @@ def unequal(blob_scene: Scene, tiny_config: Config) -> Trainer:
 def test_contributions_are_what_primitives_add_to_all_the_images(unequal: Trainer) -> None:
     expected = by_color(unequal, unequal.scene.train_views)
     assert not np.allclose(expected, expected[:, ::-1], rtol=0.1, atol=1)
-    np.testing.assert_allclose(unequal.contributions().numpy(), expected, rtol=1e-3, atol=0.05)
+    np.testing.assert_allclose(unequal.survey.contributions().numpy(), expected, rtol=1e-3, atol=0.05)
     assert not expected[::9].any()
-    some = unequal.contributions(most=3).numpy()
+    some = unequal.survey.contributions(most=3).numpy()
     of = [unequal.scene.train_views[i] for i in (0, 2, 5)]
     np.testing.assert_allclose(some, by_color(unequal, of), rtol=1e-3, atol=0.05)
 
@@ -87,7 +87,7 @@ def test_contributions_are_what_primitives_add_to_all_the_images(unequal: Traine
 def without_each(trainer: Trainer, view: View) -> tuple[np.ndarray, np.ndarray]:
     """[P, H * W * 3] float64: how the view changes with each primitive that it may show; [P] anchors of these."""
     with torch.no_grad():
-        rows, prediction = trainer.predicted(view.camera)
+        rows, prediction = trainer.survey.predicted(view.camera)
     drawn = prediction.gaussians
     whole = rasterize(drawn, view.camera).image
     changes = []
@@ -111,7 +111,7 @@ def test_squared_changes_are_those_of_images_without_an_anchor(unequal: Trainer)
     draws = [
         squared_changes(
             [(number, views[0].camera), (number + 1000, views[1].camera)],
-            unequal.predicted, unequal.shape, unequal.settings, CPU,
+            unequal.survey.predicted, unequal.shape, unequal.settings, CPU,
         )[0].numpy()
         for number in range(96)
     ]  # fmt: skip
@@ -125,9 +125,9 @@ def test_squared_changes_are_those_of_images_without_an_anchor(unequal: Trainer)
 def test_changes_are_a_mean_over_the_values_of_all_views(unequal: Trainer) -> None:
     views = unequal.scene.train_views
     numbered = [(unequal.step * len(views) + i, view.camera) for i, view in enumerate(views)]
-    total, _ = squared_changes(numbered, unequal.predicted, unequal.shape, unequal.settings, CPU)
+    total, _ = squared_changes(numbered, unequal.survey.predicted, unequal.shape, unequal.settings, CPU)
     values = sum(view.image.size for view in views)
-    assert torch.equal(unequal.changes(256), total / values)
+    assert torch.equal(unequal.survey.changes(256), total / values)
 
 
 def test_what_only_views_see_that_are_not_asked_outlasts_a_pruning(unequal: Trainer) -> None:
@@ -139,10 +139,10 @@ def test_what_only_views_see_that_are_not_asked_outlasts_a_pruning(unequal: Trai
     hidden = np.ones(unequal.model.anchors, bool)
     hidden[unequal.visible_anchors(away).numpy()] = False
     assert hidden.any()
-    assert (np.isinf(unequal.changes(1).numpy()) == hidden).all()
+    assert (np.isinf(unequal.survey.changes(1).numpy()) == hidden).all()
     bits = torch.ones(unequal.model.anchors)
-    assert paying(unequal.changes(1), bits, 0.1, unequal.config.control, 0.0).numpy()[hidden].all()
-    assert torch.isfinite(unequal.changes(2)).all()
+    assert paying(unequal.survey.changes(1), bits, 0.1, unequal.config.control, 0.0).numpy()[hidden].all()
+    assert torch.isfinite(unequal.survey.changes(2)).all()
 
 
 @pytest.mark.parametrize(("views", "asked"), [(12, 48), (81, 48), (97, 49), (300, 150), (1000, 256)])
@@ -161,7 +161,7 @@ def test_large_views_are_judged_with_sides_halved(unequal: Trainer) -> None:
     found = [
         np.mean(
             [
-                squared_changes([(number, c)], unequal.predicted, unequal.shape, unequal.settings, CPU)[
+                squared_changes([(number, c)], unequal.survey.predicted, unequal.shape, unequal.settings, CPU)[
                     0
                 ].numpy()
                 for number in range(64)
@@ -270,7 +270,7 @@ def test_several_prunings_take_as_one_at_a_higher_price_but_each_at_most_half(
 def test_pruning_takes_what_does_not_pay_by_the_bits_of_the_file(unequal: Trainer) -> None:
     model = unequal.model
     unequal.config = with_pruning(unequal.config, 20.0, ())
-    changes = unequal.changes(256).numpy()
+    changes = unequal.survey.changes(256).numpy()
     streams = model.quantized(rate=True).bits.values()
     bits = sum(stream.detach().double().numpy() for stream in streams) + 10
     ratio = 20 * changes / bits * len(bits) * 132 / 5
@@ -291,7 +291,7 @@ def test_pruning_takes_what_does_not_pay_by_the_bits_of_the_file(unequal: Traine
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.3])
 def test_the_file_gets_the_primitives_that_the_views_would_miss(unequal: Trainer, share: float) -> None:
     unequal.config = replace(unequal.config, control=replace(unequal.config.control, idle_share=share))
-    everything = unequal.contributions().numpy()
+    everything = unequal.survey.contributions().numpy()
     kept = least_first(everything.reshape(-1), share).reshape(everything.shape)
     assert kept.any() and not kept[::9].any()
     unequal.finish()
@@ -307,7 +307,7 @@ def test_a_run_ends_with_leaving_out_what_hardly_anybody_sees(blob_scene: Scene,
     )
     trainer = Trainer(blob_scene, config, CPU)
     trainer.run(None, None)
-    total, left = trainer.contributions().numpy(), trainer.model.mask.numpy()
+    total, left = trainer.survey.contributions().numpy(), trainer.model.mask.numpy()
     assert 0.7 * total.sum() < total[left].sum() < 0.9 * total.sum()
     assert total[~left].max() <= total[left].min()
 

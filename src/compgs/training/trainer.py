@@ -30,20 +30,16 @@ from compgs.render import RasterResult, RasterSettings
 from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
-from compgs.tensors import where
 from compgs.tensors.gradient_sampling import GradientSizes, with_sampled_gradients
 from compgs.tensors.prediction import (
     Geometry,
     Prediction,
     camera_center,
     geometry_of_all,
-    predict,
-    predict_geometry,
 )
-from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import DECAYS, make_optimizer, parameters_of, set_learning_rates
-from compgs.training.plan import LOOKED_AT, Plan, head_bits, plan
+from compgs.training.plan import Plan, head_bits, plan
 from compgs.training.rate.file_size import anchor_bits, fixed_bytes
 from compgs.training.rate.rate_control import RateState
 from compgs.training.rate.target_size import TargetSize
@@ -58,7 +54,6 @@ from compgs.training.run.distributed import (
     check_identical,
     mine,
     sum_gradients,
-    sum_over_ranks,
     whole,
 )
 from compgs.training.run.loop import (
@@ -85,9 +80,9 @@ from compgs.training.structure.averaging import Averaging
 from compgs.training.structure.control import AdaptiveControl, make_schedule
 from compgs.training.structure.decorrelation import ChannelRates, decorrelate, drop_silent_channels
 from compgs.training.structure.events import Event, at_shares
-from compgs.training.structure.importance import missed, spread, view_contributions
-from compgs.training.structure.pruning import judged, paying, squared_changes
-from compgs.training.survey import MEASURED_AT_ONCE, AnchorBounds
+from compgs.training.structure.importance import missed
+from compgs.training.structure.pruning import paying
+from compgs.training.survey import Survey, predict_view
 
 METHOD = "compgs"
 
@@ -154,7 +149,6 @@ class Trainer:
         self.optimizer = make_optimizer(self.model, t)
         self.average = Averaging(self.model)
         self.schedule = make_schedule(config.control, t.steps, views, per_step)
-        self.bounds = AnchorBounds(self.model, self.geometry)
         self.hidden = HiddenAnchors(self.plan.passed_over, views, self.shape, device)
         self.control = AdaptiveControl(config, self.schedule, self.shape, device, (self.hidden.replaced,))
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
@@ -163,12 +157,19 @@ class Trainer:
             background=scene.background, angular_dilation=self.model.angular_dilation
         )
         self.step = 0
+        self.survey = Survey(self.model, self.scene, self.settings, lambda: self.step)
+        self.bounds = self.survey.bounds
         self.rate = RateState(t.lmbda)
         self.decorrelated_at = at_shares(config.entropy.decorrelate_at, t.steps)
         self.channel_rates = ChannelRates(self.model, self.decorrelated_at)
         pruned_at = at_shares(config.control.prune_at, t.steps)
         self.target_size = TargetSize(
-            self.model, self.schedule, pruned_at, self.contributions, self.changes, self.plan.bit_discount
+            self.model,
+            self.schedule,
+            pruned_at,
+            self.survey.contributions,
+            self.survey.changes,
+            self.plan.bit_discount,
         )
         self.events = (
             Event(self.schedule.due, self.grow),
@@ -261,11 +262,9 @@ class Trainer:
         """Return the fraction of the run that is done, 0 to 1."""
         return self.step / self.config.training.steps
 
-    @torch.no_grad()
     def visible_anchors(self, camera: Camera) -> Tensor:
         """[V] int64: anchors whose primitives may be in the image."""
-        positions, radii = self.model.positions(), self.bounds.radii()
-        return torch.nonzero(visible_mask(positions, radii, camera, self.settings)).view(-1)
+        return self.survey.visible_anchors(camera)
 
     def quantize(self, looks: StepViews) -> Quantized:
         """Latents of the anchors in view as the decoder will have them, and their bits (Sec. 3.3)."""
@@ -314,17 +313,7 @@ class Trainer:
         geometry: Geometry | None = None,
     ) -> Prediction:
         """Predict the primitives of anchors in view; on the GPU all of them, as choosing would make the CPU wait."""
-        model = self.model
-        return predict(
-            model.heads,
-            model.primitives(latents, rows),
-            camera_center(camera, self.device),
-            model.distance_unit,
-            model.stored_head_weights() if stored else None,
-            compact=where.choosing_pays(self.device),
-            appearance_dtype=getattr(torch, self.config.training.appearance_dtype),
-            geometry=geometry,
-        )
+        return predict_view(self.model, latents, rows, camera, stored=stored, geometry=geometry)
 
     def rasterize(self, gaussians: Gaussians, camera: Camera) -> RasterResult:
         return rasterize_step(gaussians, camera, self.settings, watched=self.schedule.active(self.step))
@@ -437,25 +426,13 @@ class Trainer:
     def grow(self) -> None:
         """Add anchors where the image's gradient is large, and remove those that nobody sees."""
         with whole(self.control, AdaptiveControl.STATISTICS):
-            self.control.act(self.model, self.optimizer, self.coupled_means(), self.chance, self.rate.lmbda)
-
-    @torch.no_grad()
-    def coupled_means(self) -> Tensor:
-        """[N, K, 3] world units: where the coupled primitives are now."""
-        k = self.model.dimensions.coupled_primitives
-        every = torch.arange(self.model.anchors, device=self.device).split(MEASURED_AT_ONCE)
-        return torch.cat([self.geometry(rows)[0].view(-1, k, 3) for rows in every])
-
-    @torch.no_grad()
-    def geometry(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Means and scales [V * K, 3] of all coupled primitives of the anchors in `rows` [V] int64, world units."""
-        p = self.model.primitives(self.model.quantized(rows, stored_weights=False), rows)
-        means, scales, _ = predict_geometry(self.model.heads, p, p.residuals, p.anchor_index)
-        return means, scales
+            self.control.act(
+                self.model, self.optimizer, self.survey.coupled_means(), self.chance, self.rate.lmbda
+            )
 
     def prune(self) -> None:
         """Remove the anchors that are not worth their bits: what is left of the run makes up for them."""
-        changes = self.changes(self.plan.pruning_views)
+        changes = self.survey.changes(self.plan.pruning_views)
         bits = anchor_bits(self.model)
         lmbda, written = self.rate.lmbda_of_pruning, self.rate.written
         least, most = self.target_size.bits_that_stay(self.step, bits, written)
@@ -473,42 +450,10 @@ class Trainer:
             drop_silent_channels(self.model, self.optimizer)
         self.channel_rates.follow()
 
-    def contributions(self, most: int = LOOKED_AT) -> Tensor:
-        """[N, K] float64: what the coupled primitives add to the training views, or to at most `most` of them."""
-        views = mine(spread(self.scene.train_views, most))
-        total = view_contributions(views, self.predicted, self.shape, self.settings, self.device)
-        sum_over_ranks(total)
-        return total
-
-    def changes(self, most: int = LOOKED_AT) -> Tensor:
-        """[N] float64: mean squared change of a value of the training views, or of at most `most` of them, without an
-        anchor; of large ones with sides halved. Infinite: none of these may show the anchor, but another view might.
-        """
-        views = self.scene.train_views
-        cameras = [judged(view.camera) for view in spread(views, most)]
-        numbered = mine(
-            [(self.step * len(cameras) + number, camera) for number, camera in enumerate(cameras)]
-        )
-        total, shown_by = squared_changes(numbered, self.predicted, self.shape, self.settings, self.device)
-        sum_over_ranks(total)
-        sum_over_ranks(shown_by)
-        if len(cameras) < len(views):
-            total[shown_by == 0] = math.inf
-        return total / sum(3 * camera.width * camera.height for camera in cameras)
-
     @property
     def shape(self) -> tuple[int, int]:
         """N, K."""
         return self.model.anchors, self.model.dimensions.coupled_primitives
-
-    def predicted(self, camera: Camera) -> tuple[Tensor, Prediction] | None:
-        """The anchors [V] that a camera may show and their primitives as the file would have them; None if there are
-        none.
-        """
-        rows = self.visible_anchors(camera)
-        if len(rows) == 0:
-            return None
-        return rows, self.predict(self.model.quantized(rows), rows, camera, stored=True)
 
     # the run -------------------------------------------------------------------------------------------------------
 
@@ -553,7 +498,7 @@ class Trainer:
         """
         self.average.settle()
         self.bounds.forget()
-        everything = self.contributions(most=len(self.scene.train_views))
+        everything = self.survey.contributions(most=len(self.scene.train_views))
         self.model.mask = missed(everything, self.config.control.idle_share)
         if not self.model.mask.any():
             raise TrainingError("no primitive is visible in any training view; the run has failed")
