@@ -393,8 +393,8 @@ def one_step(device: str) -> dict[str, Any]:
         found = {"image": rendered.image, "loss": loss[None], "bits": bits[None]}
         found |= {f"gradient of {n}": p.grad for n, p in model.named_parameters() if p.grad is not None}
         found["visible anchors"] = rows
-        found["contributions"] = trainer.contributions()
-        found["changes"] = trainer.changes()
+        found["contributions"] = trainer.survey.contributions()
+        found["changes"] = trainer.survey.changes()
         return {name: tensor.detach().cpu() for name, tensor in found.items()}
 
 

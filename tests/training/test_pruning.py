@@ -136,6 +136,7 @@ def test_what_only_views_see_that_are_not_asked_outlasts_a_pruning(unequal: Trai
     away = replace(away, world_to_camera=np.diag([-1.0, 1.0, -1.0, 1.0]) @ away.world_to_camera)
     asked = replace(unequal.scene.train_views[0], camera=away)
     unequal.scene = replace(unequal.scene, train_views=(asked, unequal.scene.train_views[1]))
+    unequal.survey.scene = unequal.scene
     hidden = np.ones(unequal.model.anchors, bool)
     hidden[unequal.visible_anchors(away).numpy()] = False
     assert hidden.any()
@@ -161,9 +162,9 @@ def test_large_views_are_judged_with_sides_halved(unequal: Trainer) -> None:
     found = [
         np.mean(
             [
-                squared_changes([(number, c)], unequal.survey.predicted, unequal.shape, unequal.settings, CPU)[
-                    0
-                ].numpy()
+                squared_changes(
+                    [(number, c)], unequal.survey.predicted, unequal.shape, unequal.settings, CPU
+                )[0].numpy()
                 for number in range(64)
             ],
             0,
