@@ -112,7 +112,7 @@ def test_a_report_says_what_was_lost_and_left_out() -> None:
     done = Exported(1_500_000, 2000, 2, 3000, (40.0, 44.0), (1000000.25, 0.5, 0.0))
     assert report(Path("a.cgs"), Path("b.sog"), done) == [
         "b.sog: 1.50 MB (1,500,000 bytes), 2,000 splats of degree 2",
-        "beside a.cgs: 42.00 dB, 40.00 dB from the worst of 2 cameras",
+        "beside a.cgs: 42.00 dB, 40.00 dB from the worst of 2 cameras, in pictures as large as its photographs",
         "3,000 of 5,000 splats were left out; a lower --degree leaves room for more of them",
         "note: positions count from 1000000.25 0.5 0: .sog has no place for that; .ply and .glb do",
     ]

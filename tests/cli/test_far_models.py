@@ -1,7 +1,6 @@
 """Commands on models that lie far from the world's origin."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,11 +17,14 @@ from compgs.trained_model import TrainedModel
 
 
 def test_the_circle_is_given_in_the_world_and_looks_at_the_model() -> None:
-    positions = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
     command = Render(file=Path("a.cgs"), output=Path("out"), frames=4)
-    near = command.circle(SimpleNamespace(bounds=(positions, None), world_offset=(0.0, 0.0, 0.0)))
+    config = Config(model=ModelConfig(coupled_primitives=4, reference_dim=8, residuals=True, width=16))
+    coordinates = torch.arange(15).view(5, 3)
     offset = (4.2e6, -5.1e5, 3e3)
-    far = command.circle(SimpleNamespace(bounds=(positions, None), world_offset=offset))
+    near, far = (
+        command.circle(TrainedModel(config, coordinates, 0.05, 3.0, (0.0, 0.0, 0.0), at).as_hybrid_model())
+        for at in ((0.0, 0.0, 0.0), offset)
+    )
     assert [name for name, _ in far] == [name for name, _ in near]
     for (_, a), (_, b) in zip(near, far, strict=True):
         np.testing.assert_allclose(b.center - offset, a.center, rtol=0, atol=1e-7)

@@ -71,7 +71,7 @@ def named(value: object) -> str:
 
 
 MISTAKES = [
-    (["train", "x", "-o", "r", "-r", "2.5"], "-r: expected a whole number, found '2.5'"),
+    (["train", "x", "-o", "r", "--seed", "2.5"], "--seed: expected a whole number, found '2.5'"),
     (["train", "x", "-o", "r", "--steps", "1e4"], "--steps: expected a whole number, found '1e4'"),
     (["train", "x", "-o", "r", "--lmbda=abc"], "--lmbda: expected a number, found 'abc'"),
     (["render", "a.cgs"], "--output FOLDER|MP4|GIF is missing"),

@@ -1,7 +1,5 @@
 """The size that a file would have, against files that are written."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -58,7 +56,7 @@ def test_without_primitives_there_is_nothing(model: TrainedModel) -> None:
 def test_the_cameras_that_a_file_keeps_are_counted(model: TrainedModel) -> None:
     estimates, files = [], []
     for kept in (0, 1, 3):
-        model.config = replace(model.config, training=replace(model.config.training, viewpoints=kept))
+        model.most_viewpoints = kept
         estimates.append(fixed_bytes(model))
         files.append(len(write_content(to_content(model))))
     assert files[0] < files[1] < files[2]

@@ -79,10 +79,7 @@ def test_what_was_trained_is_what_the_file_decodes_to(trained: Trainer, tmp_path
 def test_the_estimated_size_is_that_of_the_files_streams_whose_rows_say_nothing(
     trained: Trainer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = trained.model.config
-    monkeypatch.setattr(
-        trained.model, "config", replace(config, model=replace(config.model, row_context=False))
-    )
+    monkeypatch.setattr(trained.model, "row_context", False)
     data, _ = encoded(trained.model)
     sections = {section.name: section.bytes for section in file_info(data).sections}
     estimated = trained.model.estimated_bits()

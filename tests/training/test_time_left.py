@@ -110,8 +110,8 @@ def test_looking_ahead_changes_nothing_of_a_run(blob_scene: Scene, tiny_config: 
 def test_a_trainers_camera_is_as_large_as_what_its_step_looks_at(
     blob_scene: Scene, tiny_config: Config
 ) -> None:
-    scene, config = blob_scene, tiny_config
-    large = [replace(view, camera=view.camera.resized(800, 600)) for view in scene.train_views]
+    large = [replace(view, camera=view.camera.resized(800, 600)) for view in blob_scene.train_views]
+    scene, config = replace(blob_scene, train_views=tuple(large)), tiny_config
     trainer = Trainer(scene, config, torch.device("cpu"))
     cameras = [view.camera for view in large]
     for progress in (0.0, 0.3, 0.65, 0.9):
@@ -122,7 +122,7 @@ def test_a_trainers_camera_is_as_large_as_what_its_step_looks_at(
 
 
 def test_a_status_without_it_counts_steps_at_the_present_pace() -> None:
-    from compgs.cli.progress import time_left
+    from compgs.progress import time_left
 
     status = TrainingStatus(10, 100, 0.1, 20.0, 5, "anchors", 100, 2.0, None)
     assert time_left(status) == "3 min 00 s left"

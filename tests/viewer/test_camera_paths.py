@@ -16,7 +16,7 @@ from compgs.evaluation.camera_path import read_cameras
 from compgs.viewer import camera_paths
 from compgs.viewer.camera_paths import RECORD_SECONDS, CameraPath, filmed
 
-from .test_picture import _looking as looking
+from .test_picture import looking
 
 
 def flight(count: int) -> list[Camera]:

@@ -13,7 +13,7 @@ from compgs.tensors.splats import Splats
 from compgs.viewer.overlays import MOST_POINTS, anchor_points, ellipsoids, shown_cameras, sphere
 from compgs.viewer.shown import FileShown, focus, radius
 
-from .test_picture import _looking as looking
+from .test_picture import looking
 
 
 def splat_scene(means: np.ndarray, scales: np.ndarray, opacities: np.ndarray) -> SplatModel:

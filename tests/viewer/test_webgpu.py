@@ -18,8 +18,7 @@ from compgs.viewer.gallery import gallery_server
 
 from .devtools import tab, until
 from .headless import WEBGPU_FLAGS, Visit, offers_webgpu, visit
-from .test_picture import CONTENTS, SHARED, cameras_around, make_content, written
-from .test_picture import _looking as looking
+from .test_picture import CONTENTS, SHARED, cameras_around, looking, make_content, written
 
 LEAST_DB = 45.0
 # Opens the page's file once more before the last camera: its splats take the place of those that are there.

@@ -45,7 +45,7 @@ def parse_downscale(text: str) -> int | str:
     try:
         return int(text)
     except ValueError:
-        raise UsageError(f"--downscale {text}: expected a whole number or {AUTO}") from None
+        raise UsageError(f"-r: expected a whole number or {AUTO}, found {text!r}") from None
 
 
 def parse_cameras(text: str) -> int:

@@ -9,7 +9,8 @@
 | `held_out`, `fit`, `exposure` | checks the views before they are measured, and adjusts their exposure |
 | `importance` | measures what a primitive adds to the pictures |
 | `error_account`, `error_sheet`, `contact_sheet` | show where the error is, and the pictures beside the photographs |
-| `camera_path`, `capture_cameras`, `tour`, `video` | cameras without photographs, and films along them |
+| `camera_path`, `capture_cameras`, `tour`, `clearance` | cameras without photographs, on ways clear of what is near |
+| `video`, `animation` | write films and moving pictures |
 | `reports/` | the pages and tables that `compgs report` and `compgs compare` write |
 """
 

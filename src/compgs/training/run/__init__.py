@@ -6,6 +6,7 @@
 | `parts` | what a run remembers, written once for all trainers |
 | `checkpoint`, `restoring` | write and read what a run needs to go on |
 | `distributed` | shares a step among the processes of a torchrun |
+| `time_left` | weighs the steps that are to come by the size of their pictures |
 | `profile`, `history` | say where the time went, and how the quality rose |
 | `allocation` | keeps memory that a step frees for the next one |
 | `seen_points` | checks that poses and points fit together |
