@@ -113,7 +113,7 @@ def test_large_photographs_are_reduced_on_the_cpu_unless_somebody_says_otherwise
     assert [downscale(), downscale("-r", "1"), downscale("-r", "auto")] == ["auto", 1, "auto"]
     monkeypatch.setattr("compgs.devices.chosen_device", lambda device: device or "cuda")
     assert [downscale(), downscale("-r", "auto"), downscale("--device", "cpu")] == [1, "auto", "auto"]
-    with pytest.raises(UsageError, match="--downscale half: expected a whole number or auto"):
+    with pytest.raises(UsageError, match="-r: expected a whole number or auto"):
         downscale("-r", "half")
 
 
