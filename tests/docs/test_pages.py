@@ -1,6 +1,7 @@
 """What the pages say of the code is there: files, names in them, packages; and summaries are whole sentences."""
 
 import dataclasses
+import importlib
 import re
 from pathlib import Path
 
@@ -39,3 +40,16 @@ def test_the_first_line_of_each_command_and_section_is_a_sentence() -> None:
     for kind in (*COMMANDS, *sections):
         summary = (kind.__doc__ or "").partition("\n")[0]
         assert summary.endswith("."), (kind, summary)
+
+
+def test_the_reference_has_every_name_of_the_package_where_it_is_written() -> None:
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    told = re.findall(r"^::: ([\w.]+)$", page, flags=re.MULTILINE)
+    assert sorted(path.rpartition(".")[2] for path in told) == sorted(
+        name for name in compgs.__all__ if name != "__version__"
+    )
+    for path in told:
+        module, _, name = path.rpartition(".")
+        found = getattr(importlib.import_module(module), name)
+        given = getattr(importlib.import_module(compgs._HOME[name]), name)
+        assert found is given and found.__module__ == module, path
