@@ -14,6 +14,8 @@ from compgs.scene.views import Scene
 from compgs.training import Trainer, train_splats
 from compgs.training.run.loop import chosen_config, chosen_device
 
+GOLDEN = Path(__file__).parent / "golden" / "trained.cgs"
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -76,3 +78,43 @@ def test_settings_are_those_of_the_config_or_of_the_preset() -> None:
     assert chosen_config(None, "quick") == chosen_config(load_config("quick"), None) == load_config("quick")
     with pytest.raises(ConfigError, match=r"config and preset='paper' were both given"):
         chosen_config(load_config("quick"), "paper")
+
+
+NO_PATHS = {
+    "decode": lambda given, scene: compgs.decode(given),
+    "open_scene": lambda given, scene: compgs.open_scene(given),
+    "load_scene": lambda given, scene: compgs.load_scene(given),
+    "export": lambda given, scene: compgs.export(GOLDEN, given),
+    "evaluate": lambda given, scene: compgs.evaluate(given, scene),
+    "evaluate, output": lambda given, scene: compgs.evaluate(GOLDEN, scene, output=given),
+    "compare": lambda given, scene: compgs.compare(given, GOLDEN),
+    "compare, b": lambda given, scene: compgs.compare(GOLDEN, given),
+    "report": lambda given, scene: compgs.report(given, "report.html"),
+    "report, one of them": lambda given, scene: compgs.report([given], "report.html"),
+    "report, output": lambda given, scene: compgs.report([], given),
+    "compress": lambda given, scene: compgs.compress(given, "splats.cgs"),
+    "compress, output": lambda given, scene: compgs.compress(GOLDEN, given),
+    "train, output": lambda given, scene: compgs.train(scene, output=given, steps=1),
+    "train, splats": lambda given, scene: compgs.train(scene, method="spz", splats=given, steps=1),
+}
+
+
+@pytest.mark.parametrize("call", NO_PATHS.values(), ids=list(NO_PATHS))
+def test_what_is_no_path_is_refused_with_what_was_expected(
+    call, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.chdir(tmp_path)
+    for given in (3, compgs.decode(GOLDEN)):
+        with pytest.raises(
+            ConfigError, match=rf"expected the path of a (file|folder|run), found {type(given).__name__}"
+        ):
+            call(given, scene)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_that_is_no_path_is_told_the_way_to_one(scene: Scene) -> None:
+    trained = Trainer(scene, load_config("quick"), chosen_device("cpu")).model
+    with pytest.raises(ConfigError, match=r"compgs.encode\(model, 'scene.cgs'\) writes the file"):
+        compgs.evaluate(trained, scene)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="give the path that it was opened from"):
+        compgs.evaluate(compgs.decode(GOLDEN), scene)  # type: ignore[arg-type]

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 from compgs.errors import ConfigError
 
 PRESETS = ("default", "paper", "quick")
+SHOWN_SETTINGS = 3  # that a repr shows
 MAX_VIEWPOINTS = 64  # 13 bytes each; more would say nothing new
 
 
@@ -297,6 +298,26 @@ class Config:
     control: ControlConfig = field(default_factory=ControlConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     splats: SplatConfig = field(default_factory=SplatConfig)
+
+    def __init_subclass__(cls) -> None:
+        cls.__repr__ = Config.__repr__  # type: ignore[method-assign]  # dataclass would give it one of all settings
+
+    def __repr__(self) -> str:
+        """The preset that is nearest, and what differs from it."""
+        name, differ = min(((name, self._beside(name)) for name in PRESETS), key=lambda each: len(each[1]))
+        shown = ", ".join((repr(name), *differ[:SHOWN_SETTINGS]))
+        more = len(differ) - SHOWN_SETTINGS
+        return f"{type(self).__name__}({shown}{f', and {more} more' if more > 0 else ''})"
+
+    def _beside(self, preset: str) -> list[str]:
+        """Return the settings, with their values, that differ from those of a preset."""
+        usual = load_config(preset, type(self)).to_dict()
+        return [
+            f"{section}.{name}={value!r}"
+            for section, values in self.to_dict().items()
+            for name, value in values.items()
+            if value != usual[section][name]
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         return dataclasses.asdict(self)

@@ -6,11 +6,13 @@ from pathlib import Path
 from compgs.errors import ConfigError
 
 
-def as_path(given: object, name: str) -> Path:
-    """The path that the argument `name` of a function is. Raises ConfigError for what is none."""
+def as_path(given: object, name: str, kind: str = "file") -> Path:
+    """The path of a file, or of another `kind`, that the argument `name` of a function is. Raises ConfigError for what
+    is none.
+    """
     if isinstance(given, (str, os.PathLike)):
         return Path(given)
-    found = f"{name}: expected the path of a file, found {type(given).__name__}"
+    found = f"{name}: expected the path of a {kind}, found {type(given).__name__}"
     if hasattr(given, "as_hybrid_model"):
         raise ConfigError(f"{found}; compgs.encode(model, 'scene.cgs') writes the file of a trained model")
     if hasattr(given, "gaussians"):

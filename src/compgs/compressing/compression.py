@@ -34,6 +34,7 @@ from compgs.methods import train
 from compgs.model.splats import SplatModel
 from compgs.occupied import occupied
 from compgs.outputs import check_output_file, check_output_folder, write_json
+from compgs.paths import as_path
 from compgs.progress import shown_training
 from compgs.scene.views import Scene
 from compgs.training import Plan, TrainingStatus, plan_for
@@ -102,7 +103,7 @@ def compress(
 
     Raises SplatFileError, NotACompGSFile, SceneError, ConfigError, CheckpointError, OutputError, TrainingError.
     """
-    output, source = Path(output), Path(source)
+    output, source = as_path(output, "output"), as_path(source, "source")
     if config is not None and preset is not None:
         raise ConfigError(f"config and preset={preset!r} were both given: give one")
     check_places(output, overwrite=overwrite or resume)

@@ -75,7 +75,7 @@ def evaluate(
     """
     path, scene = scene_file(as_path(file, "file")), as_scene(scene)
     if output is not None:
-        check_output_folder(Path(output), overwrite=overwrite)
+        check_output_folder(as_path(output, "output", "folder"), overwrite=overwrite)
     if flip:
         metrics.check_flip()
     if not scene.test_views:

@@ -11,6 +11,7 @@ from compgs.extras import require
 from compgs.methods.method import Method
 from compgs.notes import note
 from compgs.occupied import occupied_if_given
+from compgs.paths import as_path
 from compgs.progress import shown_training
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ def train(
     TrainingError when the optimization cannot go on.
     """
     require("train", "training")
+    from compgs.model.splats import SplatModel
     from compgs.scene import as_scene
     from compgs.training.run.distributed import rank
     from compgs.training.run.loop import Run
@@ -87,8 +89,14 @@ def train(
     chosen = _changed(known, _chosen_config(known, config, preset), changes)
     if splats is not None and not known.from_splats:
         raise ConfigError(f"splats: method {method} does not begin with plain 3DGS; leave them out")
+    if output is not None:
+        output = as_path(output, "output", "folder")
     read = as_scene(scene)
-    start = opened_splats(splats, read) if isinstance(splats, (str, Path)) else splats
+    start = (
+        splats
+        if splats is None or isinstance(splats, SplatModel)
+        else opened_splats(as_path(splats, "splats"), read)
+    )
     # Of several processes that train together, the first writes.
     with shown_training(progress) as show, occupied_if_given(None if rank() > 0 else output):
         run = Run(

@@ -25,6 +25,7 @@ from typing import Literal
 import numpy as np
 
 from compgs.errors import ConfigError, MissingSparseModel, SceneError
+from compgs.paths import as_path
 from compgs.progress import counted
 from compgs.scene.blender import TRAIN as SPLIT_FILE
 from compgs.scene.blender import read_blender
@@ -71,7 +72,7 @@ def load_scene(
     Raises SceneError or one of its kinds for missing, damaged or contradicting data, else ConfigError.
     """
     check_reading(downscale, test_every, background, split)
-    folder = Path(path)
+    folder = as_path(path, "path", "folder")
     capture = _read_layout(folder, images)
     _check_views(capture, folder)
     for posed in capture.images:

@@ -11,6 +11,7 @@ from compgs.evaluation.reports.runs import Run, read_runs
 from compgs.evaluation.reports.summary import Point
 from compgs.evaluation.reports.tables import Table
 from compgs.outputs import check_output_file, write_bytes
+from compgs.paths import as_path
 from compgs.words import short_size
 
 SHOWN_CURVES = 12  # of trainings in one chart
@@ -34,7 +35,7 @@ class Report:
 
 
 def report(
-    runs: Iterable[Run | str | Path],
+    runs: Iterable[Run | str | Path] | str | Path,
     output: str | Path,
     *,
     title: str = "Report",
@@ -46,21 +47,21 @@ def report(
 ) -> Report:
     """Write a page on runs, and beside it its tables: `NAME.md`, `NAME.tex` and a `NAME_TABLE.csv` for each.
 
-    `runs`: folders of trainings (`compgs train`) or evaluations (`compgs evaluate -o`), folders of such folders, or
-    runs that are known already. Runs that differ in their seeds only are averaged; those that differ in their rate
-    only form a curve. `output`: name of the page, ends in `.html`. `reference`: method that BD-rates are taken beside;
-    by default the first that has a curve. `views`: how many of each scene are shown, the worst. `others`: further
-    tables, such as published results, that stand behind those of the runs. `progress(done, total)` counts the scenes
-    whose pictures are read.
+    `runs`: a folder, or several, of trainings (`compgs train`) or evaluations (`compgs evaluate -o`), folders of such
+    folders, or runs that are known already. Runs that differ in their seeds only are averaged; those that differ in
+    their rate only form a curve. `output`: name of the page, ends in `.html`. `reference`: method that BD-rates are
+    taken beside; by default the first that has a curve. `views`: how many of each scene are shown, the worst. `others`:
+    further tables, such as published results, that stand behind those of the runs. `progress(done, total)` counts the
+    scenes whose pictures are read.
 
     Raises ReportError if there is nothing to report on, ConfigError for an unknown reference, OutputError.
     """
-    path = Path(output)
+    path = as_path(output, "output")
     if path.suffix.lower() not in (".html", ".htm"):
         raise OutputError(f"{path}: expected a name that ends in .html")
-    given = list(runs)
+    given = list(runs) if isinstance(runs, Iterable) and not isinstance(runs, str) else [runs]
     known = [run for run in given if isinstance(run, Run)]
-    folders = [each for each in given if not isinstance(each, Run)]
+    folders = [as_path(each, "runs", "run") for each in given if not isinstance(each, Run)]
     read, notes = read_runs(folders) if folders or not known else ([], ())
     points = summary.points_of([*known, *read])
     made = [*tables_of(points, reference), *others]
