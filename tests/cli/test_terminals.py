@@ -87,6 +87,11 @@ def test_a_mistake_is_one_clear_line_in_a_utf8_pipe(arguments: list[str], compla
     assert in_a_pipe(*arguments, locale=UTF8) == (2, "", f"error: {complaint}\n{help_line}\n")
 
 
+def test_a_size_of_photographs_that_is_none_is_one_clear_line() -> None:
+    complaint = "error: -r: expected a whole number or auto, found '2.5'\n"
+    assert in_a_pipe("train", "x", "-o", "r", "-r", "2.5", locale=UTF8) == (2, "", complaint)
+
+
 @pytest.mark.parametrize(("arguments", "complaint"), MISTAKES[:5:4], ids=named)
 def test_a_mistake_is_one_clear_line_on_a_color_terminal(arguments: list[str], complaint: str) -> None:
     code, shown = in_a_terminal(*arguments)
