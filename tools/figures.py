@@ -1,0 +1,317 @@
+"""Writes the figures of README.md and of the pages from the records beside them.
+
+    python tools/figures.py            # writes
+    python tools/figures.py --check    # says which pages differ from their records, and writes nothing
+
+A page has figures between two comments, `<!-- figures: NAME -->` and `<!-- end of figures -->`. NAME says what stands
+there: a function of this file, and what it is given. Records are docs/results/records/*.json, which tools/record.py
+writes, and the tables and records that the benchmarks leave in docs/results. A test compares all pages with their
+records, and the settings and decisions of each record with those of today's default preset.
+"""
+
+import argparse
+import csv
+import json
+import re
+import sys
+import tomllib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from compgs.outputs import write_bytes
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "docs" / "results"
+sys.path.append(str(ROOT / "benchmarks"))
+import ablation_tables  # noqa: E402
+import complexity  # noqa: E402
+import prefix as prefix_benchmark  # noqa: E402
+import quality_over_bytes  # noqa: E402
+import similarity  # noqa: E402
+import similarity_measures  # noqa: E402
+import suite_tables  # noqa: E402
+
+BLOCK = re.compile(
+    r"(?P<head>^<!-- figures: (?P<name>[^\n]*?) -->\n).*?(?P<foot>^<!-- end of figures -->$)",
+    re.DOTALL | re.MULTILINE,
+)
+
+# The records that come first in the tables: the paper's scenes.
+FIRST = ("truck", "bonsai")
+Record = dict[str, Any]
+
+
+def pages() -> list[Path]:
+    """Return every page that may have figures."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def rewritten(text: str) -> str:
+    """Return a page with all its figures made anew."""
+    return BLOCK.sub(lambda found: found["head"] + figures(found["name"]) + "\n" + found["foot"], text)
+
+
+def figures(name: str) -> str:
+    """Return the figures of this name: a function, and the words that it is given."""
+    function, *given = name.split()
+    return FUNCTIONS[function](*given)
+
+
+# records ------------------------------------------------------------------------------------------------------------
+
+
+def records() -> list[Record]:
+    """Return all records, in the order of the tables."""
+    found = [_json(path) for path in (RESULTS / "records").glob("*.json")]
+    return sorted(found, key=lambda record: (record["name"] not in FIRST, -record["results"]["bytes"]))
+
+
+def captures(folder: str) -> str:
+    """A row for each record, in a few columns. `folder` leads from the page to docs/results."""
+    lines = [
+        "| capture | training views | steps | training | PSNR | SSIM | file |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for record in records():
+        results, title = record["results"], f"[{record['title']}]({folder}/{record['page']})"
+        lines.append(
+            f"| {title} | {views(record)} | {number(record['training']['steps'])} | {minutes(record)} | "
+            f"{results['psnr']:.2f} dB | {results['ssim']:.3f} | **{size(results['bytes'])}** |"
+        )
+        lines += [
+            f"| {record['title']}, as the paper printed it | | 30 000 | | {row['psnr']:.2f} dB | {row['ssim']:.2f} | "
+            f"{size(row['bytes'])} |"
+            for row in published(record["name"])
+        ]
+    return "\n".join(lines)
+
+
+def published(name: str) -> list[Record]:
+    """The paper's own rows of a capture, largest file and smallest, where there is a suite with them."""
+    suite = ROOT / "src" / "compgs" / "suites" / "shipped" / f"{name}.toml"
+    if not suite.is_file():
+        return []
+    rows = tomllib.loads(suite.read_text(encoding="utf-8"))["published"]
+    mine = sorted((row for row in rows if row["method"] == "CompGS"), key=lambda row: -row["bytes"])
+    return [mine[0], mine[-1]]
+
+
+def printed(name: str) -> str:
+    """What other authors printed of a capture, from its suite."""
+    suite = ROOT / "src" / "compgs" / "suites" / "shipped" / f"{name}.toml"
+    rows = tomllib.loads(suite.read_text(encoding="utf-8"))["published"]
+    lines = ["| method | PSNR | SSIM | LPIPS, as 3DGS | file | source |", "|---|---:|---:|---:|---:|---|"]
+    for row in sorted(rows, key=lambda row: -row["bytes"]):
+        method = " ".join([row["method"], *([f"({row['rate']})"] if "rate" in row else [])])
+        quality = f"{row['psnr']:.2f} dB | {row['ssim']:.3g} | {row['lpips_3dgs']:.3g}"
+        lines.append(f"| {method} | {quality} | {size(row['bytes'])} | {row['source']} |")
+    return "\n".join(lines)
+
+
+def measured(*names: str) -> str:
+    """A row for each record of these names, or for each, with all that was measured."""
+    head = [
+        "capture",
+        "command",
+        "commit",
+        "held-out views",
+        "PSNR",
+        "SSIM",
+        "LPIPS, as 3DGS / as trained",
+        "bytes",
+        "anchors",
+    ]
+    head += ["bits an anchor", "training", "decoding", "a view"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for record in records():
+        if names and record["name"] not in names:
+            continue
+        r = record["results"]
+        lpips = "" if r["lpips"] is None else f"{r['lpips_3dgs']:.3f} / {r['lpips']:.3f}"
+        cells = [
+            record["title"],
+            f"`{record['command']}`",
+            record["commit"],
+            f"{r['views']} of {r['width']} x {r['height']}",
+            f"{r['psnr']:.2f} dB",
+            f"{r['ssim']:.4f}",
+            lpips,
+            number(r["bytes"]),
+            number(r["anchors"]),
+            f"{r['bits_per_anchor']:.1f}",
+            f"{minutes(record)} {record['note']}".strip(),
+            f"{1e3 * r['decode_seconds']:.0f} ms",
+            f"{1e3 * r['render_seconds']:.0f} ms",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def components(name: str) -> str:
+    """Where the bytes of a record's file are."""
+    (record,) = (record for record in records() if record["name"] == name)
+    r = record["results"]
+    lines = ["| part of the file | bytes | share | bits an anchor |", "|---|---:|---:|---:|"]
+    for part, amount in sorted(r["components"].items(), key=lambda item: -item[1]):
+        if amount:
+            share, bits = amount / r["bytes"], 8 * amount / r["anchors"]
+            lines.append(f"| {part} | {number(amount)} | {share:.1%} | {bits:.2f} |")
+    lines.append(f"| **all** | **{number(r['bytes'])}** | 100.0% | {r['bits_per_anchor']:.2f} |")
+    return "\n".join(lines)
+
+
+def views(record: Record) -> str:
+    return (
+        f"{record['plan']['start']['views']} of {record['results']['width']} x {record['results']['height']}"
+    )
+
+
+def minutes(record: Record) -> str:
+    """The seconds of the training, as people say them."""
+    seconds = record["training"]["seconds"]
+    return f"{seconds / 60:.0f} min" if seconds >= 600 else f"{seconds / 60:.1f} min"
+
+
+def size(amount: int) -> str:
+    return f"{amount / 1e6:.2f} MB" if amount >= 1e6 else f"{amount / 1e3:.0f} kB"
+
+
+def number(value: int) -> str:
+    """With a space between thousands, as the pages have it."""
+    return f"{value:,}".replace(",", " ")
+
+
+# tables of the benchmarks -------------------------------------------------------------------------------------------
+
+# What stands in the comparison for each method: the variant as published where there are several.
+COMPARED = {
+    "compgs paper": "this program's `paper` preset, at its best",
+    "cosa-gs": "COSA-GS, at its best",
+    "Scaffold-GS published": "Scaffold-GS",
+    "3dgs": "plain 3DGS (`.ply`)",
+    "sog": "plain 3DGS as `.sog`",
+    "spz": "plain 3DGS as `.spz`",
+    "c3dgs published": "c3dgs",
+    "Compact3D BitQ": "Compact3D, BitQ, at its best",
+    "LightGaussian published": "LightGaussian",
+    "EAGLES published": "EAGLES",
+    "Compact-3DGS published": "Compact-3DGS",
+}
+
+
+def methods(scene: str) -> str:
+    """All methods on one capture."""
+    return suite_tables.table(_csv(RESULTS / f"methods_{scene}.csv"))
+
+
+def compared(scene: str) -> str:
+    """One row a method: its best file by SSIM, and how many times the bytes of ours at that SSIM, and at that PSNR."""
+    rows = _csv(RESULTS / f"methods_{scene}.csv")
+    curves = {measure: suite_tables.our_curve(rows, measure) for measure in ("psnr", "ssim")}
+    lines = [
+        "| method | PSNR | SSIM | bytes | times our bytes at its PSNR | at its SSIM |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    ours = best(rows, "compgs default")
+    lines.append(
+        f"| **CompGS, `default`, largest file** | {quality(ours)} | {number(int(ours['bytes']))} | | |"
+    )
+    for name, title in COMPARED.items():
+        row = best(rows, name)
+        times = [suite_tables.times(curve, int(row["bytes"]), float(row[m])) for m, curve in curves.items()]
+        lines.append(f"| {title} | {quality(row)} | {number(int(row['bytes']))} | {times[0]} | {times[1]} |")
+    return "\n".join(lines)
+
+
+def best(rows: Sequence[dict[str, str]], method: str) -> dict[str, str]:
+    """The row of the method with the best SSIM."""
+    return max((row for row in rows if row["method"] == method), key=lambda row: float(row["ssim"]))
+
+
+def quality(row: dict[str, str]) -> str:
+    return f"{float(row['psnr']):.2f} dB | {float(row['ssim']):.3f}"
+
+
+def ablation(name: str) -> str:
+    """The variants of an ablation."""
+    return ablation_tables.table(ablation_tables.rows_of(_json(RESULTS / f"ablation_{name}.json")["records"]))
+
+
+def ablation_components(name: str) -> str:
+    """Bytes by component of the variants of an ablation."""
+    rows = ablation_tables.rows_of(_json(RESULTS / f"ablation_{name}.json")["records"])
+    return ablation_tables.component_table(rows)
+
+
+def complexity_time(name: str) -> str:
+    """Times of training, encoding, decoding and rendering."""
+    return complexity.time_table(_json(RESULTS / f"complexity_{name}.json")["rows"])
+
+
+def complexity_memory(name: str) -> str:
+    """Memory of training, encoding, decoding and rendering."""
+    return complexity.memory_table(_json(RESULTS / f"complexity_{name}.json")["rows"])
+
+
+def curves(name: str, *tables: str) -> str:
+    """Quality over bytes, from the records of ablations."""
+    every = [
+        record
+        for table in tables
+        for record in quality_over_bytes.read_records(RESULTS / f"{table}_{name}.json")
+    ]
+    return quality_over_bytes.table(quality_over_bytes.points_of(quality_over_bytes.drawn(every)))
+
+
+def prefix(name: str) -> str:
+    """Quality of the beginnings of a file."""
+    lines = prefix_benchmark.report({**_json(RESULTS / f"prefix_{name}.json"), "commit": ""}, "").splitlines()
+    return "\n".join(line for line in lines if line.startswith("|"))
+
+
+def similar(name: str) -> str:
+    """How alike neighbouring splats are."""
+    rows = [
+        similarity_measures.Similarity(**row) for row in _json(RESULTS / f"similarity_{name}.json")["rows"]
+    ]
+    return similarity.table(rows)
+
+
+FUNCTIONS: dict[str, Callable[..., str]] = {
+    function.__name__: function
+    for function in (
+        captures, printed, measured, components, methods, compared, ablation, ablation_components, complexity_time,
+        complexity_memory, curves, prefix, similar,
+    )
+}  # fmt: skip
+
+
+def _json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _csv(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return [row for row in csv.DictReader(file) if not row["method"].endswith("(published)")]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--check", action="store_true", help="write nothing, and fail if a page differs")
+    check = parser.parse_args().check
+    differ = []
+    for page in pages():
+        text = page.read_text(encoding="utf-8")
+        if (new := rewritten(text)) != text:
+            differ.append(str(page.relative_to(ROOT)))
+            if not check:
+                write_bytes(page, new.encode())
+    print("\n".join(differ) or "all pages have the figures of their records")
+    sys.exit(1 if check and differ else 0)
+
+
+if __name__ == "__main__":
+    main()
