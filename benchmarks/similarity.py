@@ -1,4 +1,4 @@
-"""What motivates the method (CompGS Fig. 1): how alike neighbouring splats of plain 3DGS are, a table and a figure.
+"""What motivates the method (CompGS Fig. 2): how alike neighbouring splats of plain 3DGS are, a table and a figure.
 
     python benchmarks/similarity.py ../shared/splats/playbot_lod3.ply
     python benchmarks/similarity.py ../shared/scenes/plush_480 -r 2 --steps 4000

@@ -1,4 +1,4 @@
-"""How alike a splat and its neighbours are (CompGS Fig. 1), by attribute.
+"""How alike a splat and its neighbours are (CompGS Fig. 2), by attribute.
 
 M splats, k neighbours each. `x` is an attribute of all splats, [M, C], centred over the scene. A neighbour is one of
 the k splats with the smallest Euclidean distance between means; positions serve for nothing else.

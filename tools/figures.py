@@ -182,6 +182,98 @@ def number(value: int) -> str:
     return f"{value:,}".replace(",", " ")
 
 
+# the paper's tables and figures --------------------------------------------------------------------------------------
+
+# As the paper prints them, MB of 2^20 bytes; measured are captures of this project, smaller and in fewer steps.
+PRINTED_COMPONENTS = "Truck: 25.41 dB in 611 MB, 25.20 dB in 30.4 MB, 25.28 dB in 10.6 MB"
+PRINTED_RESIDUALS = "Train: 20.50 dB in 5.75 MB without, 21.49 dB in 5.51 MB with"
+PRINTED_COUPLED = "Train: 22.04, 22.12, 21.90 dB in 7.87, 8.60, 8.28 MB for K = 5, 10, 15"
+PRINTED_COMPLEXITY = (
+    "Tanks and Temples: training 37.8 min, encoding 6.3 s, decoding 4.5 s, a view 5.3 ms, on its GPU"
+)
+
+
+def paper() -> str:
+    """A row for each table and figure of the paper: printed, and measured here."""
+    truck = next(record for record in records() if record["name"] == "truck")["results"]
+    times = _json(RESULTS / "complexity_plush_480.json")["rows"]["paper"]
+    alike = _json(RESULTS / "similarity_plush_480.json")
+    every = next(row for row in alike["rows"] if row["attribute"] == "all together")
+    bits = ablation_rows("bitstream_plush_480")
+    rows = [
+        (
+            "Fig. 1, quality and size beside other methods",
+            "a chart",
+            "a table of eleven methods",
+            "compared.md",
+        ),
+        (
+            "Fig. 2, similarity of neighbouring Gaussians",
+            "a chart",
+            f"plush: cosine {every['neighbours']:.2f} to neighbours, {every['random']:.2f} to random splats",
+            "results/similarity_plush_480.md",
+        ),
+        ("Fig. 3 to 5, overview, prediction, entropy models", "drawings", "pictures of a file", "method.md"),
+        (
+            "Fig. 6, rate-distortion curves",
+            "charts",
+            "curves of presets `paper` and `default` on three captures",
+            "results/ablation_curve_plush_480.md",
+        ),
+        ("Fig. 7, pictures", "pictures", "a gallery to open", "gallery.md"),
+        (
+            "Fig. 8, bits an anchor and a coupled primitive",
+            "a chart (Train)",
+            "plush, lambda 0.001, 0.005, 0.01: "
+            + ", ".join(f"{a:.0f} and {c:.1f}" for a, c in map(ablation_tables.bits_each, bits)),
+            "results/ablation_bitstream_plush_480.md",
+        ),
+        (
+            "Table 1 and appendix, Tanks and Temples",
+            "Truck: 25.28 dB in 10.6 MB to 24.72 dB in 6.27 MB",
+            f"Truck, `default`: {truck['psnr']:.2f} dB in {size(truck['bytes'])}; Train was not run",
+            "results/truck.md",
+        ),
+        ("Table 2, Deep Blending", "29.30 to 29.69 dB", "not run", "results/README.md"),
+        ("Table 3, Mip-NeRF 360", "26.37 to 27.26 dB", "not run at its size", "results/README.md"),
+        (
+            "Table 4, parts of the method",
+            PRINTED_COMPONENTS,
+            plush("components"),
+            "results/ablation_components_plush_480.md",
+        ),
+        (
+            "Table 5, residual embeddings",
+            PRINTED_RESIDUALS,
+            plush("residuals"),
+            "results/ablation_residuals_plush_480.md",
+        ),
+        ("Table 6, K", PRINTED_COUPLED, plush("coupled"), "results/ablation_coupled_plush_480.md"),
+        (
+            "Table 7, complexity",
+            PRINTED_COMPLEXITY,
+            f"plush, two CPU cores: {times['train']['seconds'] / 60:.1f} min, {times['encode']['seconds']:.2f} s, "
+            f"{times['decode']['seconds']:.2f} s, {1e3 * times['render']['seconds']:.0f} ms",
+            "results/complexity_plush_480.md",
+        ),
+    ]
+    lines = ["| in the paper | printed | measured here | page |", "|---|---|---|---|"]
+    lines += [f"| {what} | {printed} | {mine} | [page]({page}) |" for what, printed, mine, page in rows]
+    return "\n".join(lines)
+
+
+def plush(name: str) -> str:
+    """The variants of an ablation on plush, in words."""
+    rows = ablation_rows(f"{name}_plush_480")
+    return "plush: " + "; ".join(
+        f"{row.label} {row.psnr:.2f} dB in {size(int(row.bytes or 0))}" for row in rows
+    )
+
+
+def ablation_rows(name: str) -> list[ablation_tables.Row]:
+    return ablation_tables.rows_of(_json(RESULTS / f"ablation_{name}.json")["records"])
+
+
 # tables of the benchmarks -------------------------------------------------------------------------------------------
 
 # What stands in the comparison for each method: the variant as published where there are several.
@@ -281,8 +373,8 @@ def similar(name: str) -> str:
 FUNCTIONS: dict[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
-        captures, printed, measured, components, methods, compared, ablation, ablation_components, complexity_time,
-        complexity_memory, curves, prefix, similar,
+        captures, printed, measured, paper, components, methods, compared, ablation, ablation_components,
+        complexity_time, complexity_memory, curves, prefix, similar,
     )
 }  # fmt: skip
 

@@ -23,11 +23,15 @@ PAGE = ROOT / "docs" / "settings.md"
 
 INTRODUCTION = """# Settings
 
-Every setting of a training, as `src/compgs/config.py` declares it; this page is made from there by
-`tools/settings_page.py`. On the command line: `--set SECTION.NAME=VALUE`, as often as needed; `--lmbda`, `--steps`,
-`--seed` and `--target-size` are settings with options of their own. A column shows a preset's value where it differs
-from `default`. "Ref." marks values of the configuration that the paper's authors released; schedules are shares of
-the run.
+Every setting of a training. Most runs need none of them: `--lmbda`, `--steps`, `--seed` and `--target-size` have
+options of their own. `--set SECTION.NAME=VALUE` sets any other one, as often as needed. `compgs train --plan` prints
+the values that a run would use.
+
+- A column shows the value of a preset if it differs from `default`.
+- Schedules are shares of the run: 0.3 is 30 % of the steps.
+- "Ref." marks values of the configuration that the paper's authors released.
+
+`tools/settings_page.py` makes this page from `src/compgs/config.py`, where each setting has its range and its comment.
 """
 
 
@@ -46,10 +50,10 @@ def page() -> str:
 
 RULES_INTRODUCTION = """## rules
 
-What a run decides for itself in place of the settings above, by what is known before its first step
-(`src/compgs/training/plan.py`). `compgs train --plan` prints what it comes to for a scene. `--set training.rules=none`
-applies no rule, as the `paper` preset does; `--set training.rules='all but NAME, NAME'` leaves some out. A size that is
-asked for counts as the lambda that such files come of.
+A rule replaces a setting above by facts that are known before the first step of a run (`src/compgs/training/plan.py`).
+`compgs train --plan` prints the decisions for a scene. `--set training.rules=none` applies no rule, as the `paper`
+preset does. `--set training.rules='all but NAME, NAME'` leaves some out. For rules, a requested size counts as the
+lambda that gives such files.
 
 | rule | decides | when | measured |
 |---|---|---|---|

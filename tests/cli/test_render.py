@@ -132,12 +132,16 @@ def test_without_ffmpeg_a_video_is_refused_before_anything_is_read(
     assert "pip install '.[video]' in the project's folder" in capsys.readouterr().err
 
 
-def test_an_animation_has_the_frames_of_the_way_and_their_pace(tiny_cgs: Path, tmp_path: Path) -> None:
-    out = tmp_path / "tour.gif"
+@pytest.mark.parametrize("kind", ["gif", "webp"])
+def test_an_animation_has_the_frames_of_the_way_and_their_pace(
+    tiny_cgs: Path, tmp_path: Path, kind: str
+) -> None:
+    out = tmp_path / f"tour.{kind}"
     assert rendered(tiny_cgs, "--frames", 4, *SIZE, "--fps", 10, "-o", out) == 0
     assert rendered(tiny_cgs, "--frames", 4, *SIZE, "-o", tmp_path / "images") == 0
     with Image.open(out) as animation:
-        assert (animation.format, animation.n_frames, animation.size) == ("GIF", 4, (48, 32))
+        assert (animation.format, animation.n_frames, animation.size) == (kind.upper(), 4, (48, 32))
+        animation.load()
         assert animation.info["duration"] == 100 and animation.info["loop"] == 0
         for i in range(4):
             animation.seek(i)
@@ -145,12 +149,27 @@ def test_an_animation_has_the_frames_of_the_way_and_their_pace(tiny_cgs: Path, t
             assert psnr(np.asarray(animation.convert("RGB")), image) > 25
 
 
+def test_a_label_stands_in_the_corner_and_leaves_the_rest_of_the_picture(
+    tiny_cgs: Path, tmp_path: Path
+) -> None:
+    size = ("--width", 200, "--height", 120)
+    assert rendered(tiny_cgs, "--frames", 1, *size, "-o", tmp_path / "plain") == 0
+    assert rendered(tiny_cgs, "--frames", 1, *size, "--label", "{bytes}", "-o", tmp_path / "labelled") == 0
+    assert rendered(tiny_cgs, "--frames", 1, *size, "--label", "other", "-o", tmp_path / "other") == 0
+    plain, labelled, other = (
+        np.asarray(Image.open(tmp_path / name / "00000.png")) for name in ("plain", "labelled", "other")
+    )
+    changed = np.argwhere((plain != labelled).any(2))
+    assert len(changed) > 50 and changed[:, 0].min() > 80 and changed[:, 1].max() < 120
+    assert (labelled != other).any(), "the words are those that were asked for"
+
+
 @pytest.mark.parametrize("name", ["out.webm", "out.PNG", "out.mov"])
 def test_files_that_are_not_written_are_refused(
     tiny_cgs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     assert rendered(tiny_cgs, "-o", tmp_path / name) == 2
-    assert "a folder for PNG images, or a name that ends in .mp4 or .gif" in capsys.readouterr().err
+    assert "a folder for PNG images, or a name that ends in .mp4, .webp or .gif" in capsys.readouterr().err
     assert not (tmp_path / name).exists()
 
 

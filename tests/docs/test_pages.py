@@ -8,6 +8,7 @@ from pathlib import Path
 import compgs
 from compgs import config
 from compgs.cli.main import COMMANDS
+from compgs.viewer.page import html_page
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = Path(compgs.__file__).parent
@@ -40,6 +41,16 @@ def test_the_first_line_of_each_command_and_section_is_a_sentence() -> None:
     for kind in (*COMMANDS, *sections):
         summary = (kind.__doc__ or "").partition("\n")[0]
         assert summary.endswith("."), (kind, summary)
+
+
+def test_every_file_of_the_gallery_opens_and_makes_a_page() -> None:
+    files = sorted((ROOT / "docs" / "gallery").glob("*.cgs"))
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    assert files
+    for file in files:
+        assert compgs.decode(file).anchors > 100, "written by an older format? make it again"
+        assert f"(gallery/{file.name})" in page and f'"gallery/{file.stem}.html"' in page
+        assert len(html_page(file.read_bytes(), file.stem)) > file.stat().st_size
 
 
 def test_the_reference_has_every_name_of_the_package_where_it_is_written() -> None:

@@ -17,7 +17,7 @@ from compgs.cli.run_folder import RunSettings, SceneSource, file_and_run
 from compgs.cli.scenes import read_scene
 from compgs.cli.usage import UsageError, check_range
 from compgs.outputs import check_output_file, check_output_folder, filling, write_bytes, write_json
-from compgs.words import duration
+from compgs.words import duration, size
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,7 +37,8 @@ ELEVATIONS, DISTANCES = (25.0, 40.0, 60.0), (2.2, 1.6, 3.0)
 OF_WAY, OF_CIRCLE = ("path", "frames", "width", "height"), ("up", "elevation", "distance")
 MAX_SIDE = 16_384  # pixels
 # What somebody who names such a file does not want as a folder.
-OTHER_MEDIA = (".apng", ".avi", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".webm", ".webp")
+OTHER_MEDIA = (".apng", ".avi", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".webm")
+ANIMATIONS = (".webp", ".gif")
 VIDEO_BYTES = 16 << 20  # that must be free for a video; a long one fails later
 
 
@@ -60,14 +61,14 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
 
     compgs render garden.cgs --frames 120 --width 960 --height 540 -o garden.mp4
 
-    compgs render garden.cgs --frames 40 --width 320 --fps 15 -o garden.gif
+    compgs render garden.cgs --frames 40 --width 320 --fps 15 --label "{bytes}" -o garden.webp
 
     compgs render garden.cgs --path path.json --frames 300 -o flight.mp4
     """
 
-    output: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER|MP4|GIF")]
+    output: Annotated[Path, arg(aliases=["-o"], metavar="FOLDER|MP4|WEBP|GIF")]
     """Folder for the images, or one file for all of them: a video, a name that ends in .mp4 (needs `pip install
-    '.[video]'` in the project's folder), or an animation, .gif."""
+    '.[video]'` in the project's folder), or an animation, .webp or .gif."""
 
     background: Annotated[
         tuple[float, float, float] | None, arg(metavar="R G B", help_behavior_hint=NO_DEFAULT)
@@ -117,6 +118,9 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
     ] = None
     """Of the circle from the middle of the scene; by default another one where it would lead through something."""
 
+    label: Annotated[str | None, arg(metavar="TEXT", help_behavior_hint=NO_DEFAULT)] = None
+    """Words in the lower left corner of each picture; {bytes} stands for the size of the file."""
+
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace the video, or the images that are in FOLDER already: all of them, also those beyond the new ones."""
 
@@ -147,7 +151,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
     @property
     def video(self) -> bool:
         """Whether all frames become one file."""
-        return self.output.suffix.lower() in (".mp4", ".gif")
+        return self.output.suffix.lower() in (".mp4", *ANIMATIONS)
 
     def check_values(self) -> None:
         """Raises UsageError."""
@@ -206,7 +210,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
         """Raises UsageError, OutputError, MissingDependency."""
         if self.output.suffix.lower() in OTHER_MEDIA:
             raise UsageError(
-                f"--output {self.output}: expected a folder for PNG images, or a name that ends in .mp4 or .gif"
+                f"--output {self.output}: expected a folder for PNG images, or a name that ends in .mp4, .webp or .gif"
             )
         if not self.video:
             check_output_folder(self.output, overwrite=self.overwrite)
@@ -286,11 +290,23 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
         times: list[float] = []
         with counting("rendering") as progress:
             frames = rendered(model, [camera for _, camera in views], times, progress)
+            if self.label:
+                frames = self.labelled(frames)
             if self.video:
                 self.write_video(frames, views)
             else:
                 self.write_images(frames, views)
         say(f"{len(views)} images in {self.output}, {duration(median(times))} a view")
+
+    def labelled(self, frames: "Iterator[np.ndarray]") -> "Iterator[np.ndarray]":
+        """Write --label on each frame."""
+        from compgs.evaluation.animation import labelled
+        from compgs.formats import component_bytes
+
+        file, _ = file_and_run(self.file)
+        whole = sum(component_bytes(file).values())  # of all files, if the scene is in several
+        text = str(self.label).replace("{bytes}", size(whole))
+        return (labelled(frame, text) for frame in frames)
 
     def write_video(self, frames: "Iterator[np.ndarray]", views: "Sequence[tuple[str, Camera]]") -> None:
         """Raises UsageError, OutputError."""
@@ -301,7 +317,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
         if len(sizes) > 1:
             found = ", ".join(f"{width} x {height}" for width, height in sizes[:2])
             raise UsageError(f"{self.output}: a video has one size, the views have {found}; name a folder")
-        write = write_animation if self.output.suffix.lower() == ".gif" else write_video
+        write = write_animation if self.output.suffix.lower() in ANIMATIONS else write_video
         write(self.output, frames, frames_per_second=self.fps)
 
     def write_images(self, frames: "Iterator[np.ndarray]", views: "Sequence[tuple[str, Camera]]") -> None:
