@@ -16,7 +16,7 @@ def test_components_are_shown_with_their_sum(capsys: pytest.CaptureFixture[str])
 
 
 def test_beginnings_of_a_file_are_shown_with_what_they_hold(capsys: pytest.CaptureFixture[str]) -> None:
-    console.print_ranges([RangeInfo(3, 59, 4118), RangeInfo(8, 12_800, 84_019)])
+    console.print_ranges([RangeInfo(3, 59, 4118, 200), RangeInfo(8, 12_800, 84_019, 60_000)])
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == ["3", "59", "4,118"]
     assert lines[2].split() == ["8", "12,800", "84,019"]

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from compgs.cameras import Camera
+from compgs.codec.decoder import decode_bytes
 from compgs.codec.reader import read_content
 from compgs.codec.reduce import without_coupled
 from compgs.codec.writer import write_content
@@ -22,6 +23,7 @@ from compgs.formats.tiled import Core, GroundAxes, read_manifest
 from compgs.formats.tiled_scene import ASKED_BY, TileCache, TiledScene, resident_bytes, tile_memory
 from compgs.formats.tiled_writer import NewTile, _counted_from, common_offset, spheres, write_tiles
 from compgs.gaussians import Gaussians
+from compgs.ordering.order import canonical_order, level_counts
 from compgs.render import RasterSettings, Renderable, rasterize, render, settings_of
 
 APART = 8.0  # world units between the middles of two tiles
@@ -226,6 +228,36 @@ def test_a_manifest_is_read_as_it_was_written(folder: Path, contents: list[bytes
         np.testing.assert_allclose(kept.world_to_camera, camera.world_to_camera, rtol=1e-11, atol=1e-12)
 
 
+def from_coarse_to_fine(data: bytes) -> bytes:
+    """The same scene, with a range for each octree level that has anchors of its own."""
+    content = read_content(data)
+    counts = level_counts(content.coordinates[canonical_order(content.coordinates)])
+    levels = [i for i, count in enumerate(counts) if i == 0 or count > counts[i - 1]]
+    levels[-1] = len(counts) - 1
+    return write_content(content, levels=levels)
+
+
+def test_levels_of_a_tile_are_the_beginnings_of_its_file_that_are_scenes(
+    contents: list[bytes], tmp_path: Path
+) -> None:
+    data = from_coarse_to_fine(contents[0])
+    (tile,) = read_manifest(write_tiles(tmp_path / "x.tiles", [NewTile("a", data)])).tiles
+    assert len(tile.levels) > 2
+    for level in tile.levels:
+        model = decode_bytes(data[: level.bytes], tmp_path, prefix=True)
+        assert (model.anchors, model.coupled) == (level.anchors, level.coupled_primitives)
+    with pytest.raises(BitstreamError):  # no byte less
+        decode_bytes(data[: tile.levels[0].bytes - 1], tmp_path, prefix=True)
+
+
+def test_a_manifest_from_before_tiles_had_levels_is_read(copy: Path) -> None:
+    content = json.loads((copy / "manifest.json").read_bytes())
+    for tile in content["tiles"]:
+        del tile["levels"]
+    forged(copy, {"tiles": content["tiles"]})
+    assert [tile.levels for tile in read_manifest(copy / "manifest.json").tiles] == [()] * 4
+
+
 def test_the_frame_of_tiles_with_one_offset_is_theirs() -> None:
     assert common_offset([(1.5, 2.0, 3.0)] * 2) == (1.5, 2.0, 3.0)
     assert common_offset([(0.0, 0.0, 0.0), (1.0, 2.0, 3.3)]) == (0.0, 1.0, 2.0)
@@ -272,8 +304,8 @@ def forged(copy: Path, whole: dict[str, object] | None = None, **changes: object
     path = copy / "manifest.json"
     content = json.loads(path.read_text())
     rest = {k: v for k, v in content.items() if k not in ("format", "version", "checksum")}
-    rest["tiles"][0] |= changes
     rest |= whole or {}
+    rest["tiles"][0] |= changes
     text = json.dumps(rest, sort_keys=True, separators=(",", ":"))
     head = {"format": "compgs tiles", "version": 1, "checksum": hashlib.sha256(text.encode()).hexdigest()}
     path.write_text(json.dumps(head | rest))
@@ -294,6 +326,12 @@ def forged(copy: Path, whole: dict[str, object] | None = None, **changes: object
         {"spheres": [[0, 0, 0, -1]]},
         {"spheres": [[0, 0, 0, "x"]]},
         {"core": {"low": [1, 0], "high": [0, 1]}},
+        {"levels": 7},
+        {"levels": [[100, 5]]},
+        {"levels": [[100, 5, -1]]},
+        {"levels": [[200, 5, 1], [100, 6, 2]]},
+        {"levels": [[100, 6, 2], [200, 6, 2]]},
+        {"levels": [[1 << 40, 6, 2]]},
     ],
 )
 def test_a_manifest_of_nonsense_is_refused_also_where_its_checksum_matches(
@@ -325,7 +363,8 @@ def test_a_manifest_without_a_dilation_is_drawn_as_before_there_was_one(copy: Pa
 
 
 @pytest.mark.parametrize(
-    "changes", [{"anchors": 5}, {"coupled_primitives": 5}, {"world_offset": [0.0, 0.0, 1.0]}]
+    "changes",
+    [{"anchors": 9_000}, {"coupled_primitives": 90_000}, {"world_offset": [0.0, 0.0, 1.0]}],
 )
 def test_a_file_that_holds_another_scene_than_the_manifest_says_is_refused(
     copy: Path, changes: dict[str, object]

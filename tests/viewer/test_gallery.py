@@ -12,9 +12,11 @@ import pytest
 from PIL import Image
 
 import compgs
+from compgs.formats.tiled_writer import NewTile, write_tiles
 from compgs.metrics import psnr, to_8bit
 from compgs.viewer.gallery import byte_range, gallery_page, gallery_server
 from compgs.viewer.thumbnails import Thumbnails
+from compgs.words import short_size
 
 DATA = bytes(range(256)) * 8
 
@@ -91,6 +93,30 @@ def test_a_scenes_page_has_its_name_and_a_way_back(address: tuple[str, int]) -> 
     body = ask(address, "/view?url=%2Ffiles%2Finner%2Fa%2520%253Cb%253E.cgs")[2].decode()
     assert "<title>inner/a &lt;b&gt;</title>" in body
     assert body.count("</body>") == 1 and '<a href="/"' in body.rpartition("</script>")[2]
+
+
+def test_a_scene_of_tiles_is_one_in_the_list_and_its_files_are_served(
+    address: tuple[str, int], folder: Path
+) -> None:
+    write_tiles(folder / "town.tiles", [NewTile(name, GOLDEN.read_bytes()) for name in ("a", "b")])
+    page = gallery_page(folder.resolve(), Thumbnails()).decode()
+    assert page.count('<span class="name">town</span>') == 1 and "town.tiles/a" not in page
+    assert 'href="/view?url=%2Ffiles%2Ftown.tiles%2Fmanifest.json"' in page
+    size = sum(file.stat().st_size for file in (folder / "town.tiles").iterdir())
+    assert short_size(size) in page
+    status, headers, body = ask(address, "/files/town.tiles/manifest.json")
+    assert (status, headers["Content-Type"]) == (200, "application/json")
+    assert body == (folder / "town.tiles" / "manifest.json").read_bytes()
+    assert ask(address, "/files/town.tiles/a.cgs", Range="bytes=5-9")[2] == GOLDEN.read_bytes()[5:10]
+    assert ask(address, "/thumbnails/town.tiles/manifest.json")[0] == 200
+    view = ask(address, "/view?url=%2Ffiles%2Ftown.tiles%2Fmanifest.json")[2].decode()
+    assert "<title>town</title>" in view
+
+
+def test_another_manifest_is_not_served(address: tuple[str, int], folder: Path) -> None:
+    (folder / "manifest.json").write_text('{"password": "secret"}')
+    assert ask(address, "/files/manifest.json")[0] == 404
+    assert "manifest" not in gallery_page(folder.resolve(), Thumbnails()).decode()
 
 
 def test_an_empty_folder_says_how_a_file_gets_there(tmp_path: Path) -> None:

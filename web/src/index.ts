@@ -16,3 +16,6 @@ export { type Camera, cameraCentre, poseOf } from "./cameras.ts";
 export { ProgressiveDecoder } from "./progressive.ts";
 export { type SceneInfo, sceneInfo } from "./scene_info.ts";
 export { splatBudget } from "./budget.ts";
+export { type Plan, type Sight, type Step, planDetail, sizeOf } from "./tiles/detail.ts";
+export { TileLoader, type TileLoaderOptions } from "./tiles/loader.ts";
+export { type Manifest, type TileEntry, type TileLevel, isManifest, readManifest } from "./tiles/manifest.ts";

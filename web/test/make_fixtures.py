@@ -9,11 +9,13 @@ FOLDER gets, for each made-up content and each file that is named:
   section of latents; numbers of the scene; and the Gaussians that a camera sees, as offsets into NAME.bin;
 - NAME.bin: little-endian float32 arrays: those of FIELDS, then the sizes that scales are shares of.
 
-and refused.json: damaged files, with the name of the error of each, or the number of anchors.
+and refused.json: damaged files, with the name of the error of each, or the number of anchors; and city.tiles, a scene
+of tiles.
 """
 
 import base64
 import hashlib
+import itertools
 import json
 import sys
 import zlib
@@ -36,6 +38,7 @@ from compgs.codec.reader import file_info, read_latents  # noqa: E402
 from compgs.codec.viewpoints import Viewpoint, Viewpoints  # noqa: E402
 from compgs.codec.writer import write_content  # noqa: E402
 from compgs.errors import BitstreamError  # noqa: E402
+from compgs.formats.tiled_writer import NewTile, write_tiles  # noqa: E402
 from compgs.ordering.order import canonical_order, level_counts  # noqa: E402
 
 FIELDS = {"means": 3, "quaternions": 4, "scales": 3, "opacities": 1, "colors": 3}  # columns
@@ -62,6 +65,7 @@ NEIGHBOURS = (
 )
 WITH_ROWS: dict[str, Any] = {"angular_dilation": 2.0**-18, "row_context": True}
 MUTANTS = 150
+SIDE = 5  # tiles of the city
 STARTS = (b"", b"\x93", b"\x93CG", b"CGS", b"\x93CGS", b"\x93CGS\2\0", b"\x93CGS\1\0\5", b"PK\3\4")
 # In place of levels: a range for each that has anchors of its own, and one for all of them.
 EVERY_LEVEL, ONE_RANGE = [-1], [-2]
@@ -266,6 +270,17 @@ def _written(content: FileContent, levels: list[int] | None) -> bytes:
     return write_content(content, levels=levels)
 
 
+def city(folder: Path) -> None:
+    """SIDE x SIDE tiles side by side along x and z, each from coarse to fine."""
+    content = _with_heads(make_content(900, 19, make_dimensions(5, paper_groups(12, 0))))
+    pitch = float(np.ptp(content.coordinates, axis=0).max()) * content.voxel_size
+    tiles = []
+    for i, j in itertools.product(range(SIDE), repeat=2):
+        placed = replace(content, world_offset=(i * pitch, 0.0, j * pitch))
+        tiles.append(NewTile(f"{i}_{j}", _written(placed, EVERY_LEVEL)))
+    write_tiles(folder, tiles)
+
+
 def main() -> None:
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
@@ -279,6 +294,7 @@ def main() -> None:
         (folder / f"{name}.bin").write_bytes(arrays)
         print(f"{name}: {len(data)} bytes, {description['gaussians']} Gaussians")
     (folder / "refused.json").write_text(json.dumps(refused(small)))
+    city(folder / "city.tiles")
 
 
 if __name__ == "__main__":

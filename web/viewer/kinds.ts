@@ -30,16 +30,17 @@ const KINDS: Kind[] = [
     remedy: "If the address of a file was meant, it leads elsewhere: to a page, or to a login.",
   },
   {
-    name: "JSON",
-    begins: "{",
-    remedy: "A scene in tiles is shown tile by tile: open one of its .cgs files.",
+    name: "the list of a scene's tiles",
+    begins: '{"format":"compgs tiles"',
+    remedy: "Its tiles are fetched from beside it: `compgs serve` shows the folder.",
   },
+  { name: "JSON", begins: "{", remedy: "Of a scene in tiles, `compgs serve` shows the folder." },
 ];
 
 /** Two sentences, or null of a file that is not known. */
 export function whatItIs(head: Uint8Array): { title: string; remedy: string } | null {
   if (!head.length) return { title: "This file is empty", remedy: "Copy or download it again." };
-  const letters = String.fromCharCode(...head.subarray(0, 16)).trimStart();
+  const letters = String.fromCharCode(...head.subarray(0, 32)).trimStart();
   const kind = KINDS.find(({ begins }) => letters.startsWith(begins));
   return kind ? { title: `This is ${kind.name}, not a .cgs file`, remedy: kind.remedy } : null;
 }

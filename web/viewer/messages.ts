@@ -1,6 +1,7 @@
 /** What page and worker say to each other. Everything is in the local frame of the scene. */
 
 import type { SceneInfo } from "../src/scene_info.ts";
+import type { Sight } from "../src/tiles/detail.ts";
 import type { FirstView } from "./first_view.ts";
 import type { Vector } from "./pose.ts";
 
@@ -11,7 +12,12 @@ export interface Eye {
   centre: [number, number, number];
   /** Third row of the rotation: the direction of depth. */
   axis: [number, number, number];
+  /** The same for a picture as large as it is at rest. */
+  sight: Sight;
 }
+
+/** Rows of 2048 primitives that the renderer has. */
+export type Rows = number[];
 
 export type ToWorker =
   /** `most`: splats that are wanted; finer parts of the file that would be more are left out. */
@@ -26,18 +32,21 @@ export type ToWorker =
 export type FromWorker =
   | { kind: "progress"; loaded: number; total: number | null }
   | { kind: "scene"; info: SceneInfo; first: FirstView }
+  /** More, or less, of a scene of tiles is there. */
+  | { kind: "counts"; anchors: number; coupled: number }
   /** World units along the ray, null where there is nothing. */
   | { kind: "picked"; id: number; distance: number | null }
-  | { kind: "geometry"; planes: Float32Array<ArrayBuffer>; rows: number }
-  /** Primitives to draw, the farthest first; colors and opacities of some rows of them. */
-  | {
-      kind: "frame";
-      id: number;
-      order: Uint32Array<ArrayBuffer>;
-      appearance: Float32Array<ArrayBuffer> | null;
-      firstRow: number;
-      settled: boolean;
-    }
+  /** Everything is forgotten; there is room for so many rows. */
+  | { kind: "reserve"; rows: number }
+  | { kind: "geometry"; planes: Float32Array<ArrayBuffer>; rows: Rows }
+  /** Colors and opacities. */
+  | { kind: "appearance"; values: Float32Array<ArrayBuffer>; rows: Rows }
+  /**
+   * Primitives to draw, the farthest first. `settled`: all colors are those of this eye; `sharp`: and everything that
+   * it needs is there.
+   */
+  | { kind: "frame"; id: number; order: Uint32Array<ArrayBuffer>; settled: boolean; sharp: boolean }
+  /** Everything is there, or of a scene of tiles everything that the eye at hand needs. */
   | { kind: "complete"; bytes: number }
   /** `head`: the first bytes of the file, as far as there are any. */
   | { kind: "error"; name: string; message: string; head: Uint8Array };

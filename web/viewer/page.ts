@@ -20,11 +20,12 @@ function embedded(): Uint8Array | null {
   return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 }
 
-/** The name of a file in an address, without its ending. */
+/** The name of a file in an address, without its ending; of a manifest, that of the folder of tiles. */
 function nameOf(url: string): string {
-  const last = new URL(url, document.baseURI).pathname.split("/").pop()!;
+  const parts = new URL(url, document.baseURI).pathname.replace(/\/manifest\.json$/, "").split("/");
+  const last = parts.pop()!;
   try {
-    return decodeURIComponent(last).replace(/\.cgs$/, "") || document.title;
+    return decodeURIComponent(last).replace(/\.(cgs|tiles)$/, "") || document.title;
   } catch {
     return last; // it has a percent sign that is no code
   }
@@ -72,12 +73,22 @@ function askedRenderer(): RendererName | undefined {
   throw new Error(`The address asks for renderer=${asked}; there are webgpu and webgl2.`);
 }
 
+/** Splats that ?splats= asks for at most. */
+function askedSplats(): number | undefined {
+  const asked = new URLSearchParams(location.search).get("splats");
+  if (asked === null) return undefined;
+  if (!(Number(asked) >= 1))
+    throw new Error(`The address asks for splats=${asked}, expected a number above 0`);
+  return Number(asked);
+}
+
 function start(): void {
   let described = "";
   let isShown = false;
   const hint = new Hint(element("hint"));
   const viewer = new Viewer(element("view"), {
     renderer: askedRenderer(),
+    most: askedSplats(),
     keys: window,
     onMove() {
       hint.fade();

@@ -29,7 +29,19 @@ export function distanceAlong(
   opacities: ArrayLike<number>,
   near: number,
 ): number | null {
-  const met: Array<[number, number]> = []; // distance, alpha
+  return halfOf(meetings(origin, direction, pixel, { means, quaternions, scales, sound }, opacities, near));
+}
+
+/** Distance and alpha of each splat that the ray meets, in no order. */
+export function meetings(
+  origin: Vector,
+  direction: Vector,
+  pixel: number,
+  { means, quaternions, scales, sound }: Splats,
+  opacities: ArrayLike<number>,
+  near: number,
+): Array<[number, number]> {
+  const met: Array<[number, number]> = [];
   for (let p = 0; p < opacities.length; p++) {
     if (!sound[p] || !(opacities[p]! > 1 / 255)) continue;
     const v = [0, 1, 2].map((axis) => means[3 * p + axis]! - origin[axis]!) as Vector;
@@ -51,6 +63,11 @@ export function distanceAlong(
     const alpha = Math.min(0.999, opacities[p]! * Math.exp(-0.5 * Math.max(0, aa - (ab * ab) / bb)));
     if (alpha > 1 / 255) met.push([along, alpha]);
   }
+  return met;
+}
+
+/** Where half of the light has met something; null where too little of it has. */
+export function halfOf(met: Array<[number, number]>): number | null {
   met.sort((one, other) => one[0] - other[0]);
   let left = 1;
   for (const [distance, alpha] of met) {

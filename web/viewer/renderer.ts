@@ -23,19 +23,27 @@ export interface Renderer {
   background: [number, number, number];
   /** As the scene has it. */
   angularDilation: number | null;
-  /**
-   * New splats, of which none is drawn yet.
-   *
-   * `planes`: of `rows` rows of 2048 primitives, means, then upper and lower parts of covariances, 4 floats each.
-   */
-  setGeometry(planes: Float32Array<ArrayBuffer>, rows: number): void;
-  /** Colors and opacities of whole rows of primitives, from `firstRow` on. */
-  setAppearance(values: Float32Array<ArrayBuffer>, firstRow: number): void;
+  /** Room for so many rows of 2048 primitives, of which none is drawn yet. */
+  reserve(rows: number): void;
+  /** Of some rows, one after the other: means, then upper and lower parts of covariances, 4 floats each. */
+  setGeometry(planes: Float32Array<ArrayBuffer>, rows: readonly number[]): void;
+  /** Colors and opacities of some rows, one after the other. */
+  setAppearance(values: Float32Array<ArrayBuffer>, rows: readonly number[]): void;
   /** Which primitives are drawn, the farthest first. */
   setOrder(order: Uint32Array<ArrayBuffer>): void;
   draw(camera: FrameCamera): void;
   /** Gives back what it holds; `lost` may tell of that. */
   dispose(): void;
+}
+
+/** Rows that lie one after the other, as one: the first of them, how many, and where they begin in the list. */
+export function* runsOf(rows: readonly number[]): Generator<{ first: number; count: number; at: number }> {
+  for (let at = 0; at < rows.length;) {
+    let count = 1;
+    while (rows[at + count] === rows[at]! + count) count++;
+    yield { first: rows[at]!, count, at };
+    at += count;
+  }
 }
 
 /** The browser or its device cannot draw. */

@@ -7,15 +7,18 @@ export function rowsOf(primitives: number): number {
   return Math.max(1, Math.ceil(primitives / ROW));
 }
 
-/** Three planes of 4 floats: mean; covariance xx xy xz; covariance yy yz zz. */
-export function geometryPlanes({ means, quaternions, scales }: Geometry): Float32Array<ArrayBuffer> {
+/** Three planes of 4 floats: mean, moved by `shift`; covariance xx xy xz; covariance yy yz zz. */
+export function geometryPlanes(
+  { means, quaternions, scales }: Geometry,
+  shift: readonly [number, number, number],
+): Float32Array<ArrayBuffer> {
   const count = means.length / 3;
   const plane = 4 * ROW * rowsOf(count);
   const planes = new Float32Array(PLANES * plane);
   for (let p = 0; p < count; p++) {
     const covariance = covarianceOf(quaternions, scales, p);
     for (let i = 0; i < 3; i++) {
-      planes[4 * p + i] = means[3 * p + i]!;
+      planes[4 * p + i] = means[3 * p + i]! + shift[i]!;
       planes[plane + 4 * p + i] = covariance[i]!;
       planes[2 * plane + 4 * p + i] = covariance[3 + i]!;
     }
@@ -57,7 +60,7 @@ export function appearanceRows(
   appearance: Appearance,
   first: number,
   end: number,
-): { values: Float32Array<ArrayBuffer>; firstRow: number } {
+): { values: Float32Array<ArrayBuffer>; firstRow: number; rows: number } {
   const { opacities, colors } = appearance;
   const firstRow = Math.floor(first / ROW);
   const rows = Math.max(1, Math.ceil(end / ROW) - firstRow);
@@ -70,5 +73,5 @@ export function appearanceRows(
     values[at + 2] = colors[3 * p + 2]!;
     values[at + 3] = opacities[p]!;
   }
-  return { values, firstRow };
+  return { values, firstRow, rows };
 }

@@ -3,6 +3,7 @@
 import { splatBudget } from "../src/budget.ts";
 import type { Camera } from "../src/cameras.ts";
 import type { SceneInfo } from "../src/scene_info.ts";
+import type { Sight } from "../src/tiles/detail.ts";
 import { chooseRenderer } from "./choose_renderer.ts";
 import { Controls } from "./controls.ts";
 import type { FromWorker, ToWorker } from "./messages.ts";
@@ -51,6 +52,7 @@ export class Viewer {
   private view = 0;
   private eyeId = 0;
   private settledId = -1;
+  private sharpId = -1;
   private waitingToSettle: Array<() => void> = [];
   private isDrawing = false;
   /** A camera that stays until the controls move: its picture has exactly its size. */
@@ -96,7 +98,7 @@ export class Viewer {
     return this.renderer?.canvas ?? null;
   }
 
-  /** Shows a file: its bytes, or the address to stream it from. */
+  /** Shows a file: its bytes, or the address to stream it from; of a scene of tiles, the address of its manifest. */
   open(source: ArrayBuffer | Uint8Array | string): void {
     this.info = null;
     this.view = 0;
@@ -212,7 +214,7 @@ export class Viewer {
     await this.settled();
   }
 
-  /** Resolves when everything that is drawn is of the camera at hand. */
+  /** Resolves when everything that is drawn is of the camera at hand, and of tiles all that it needs is there. */
   settled(): Promise<void> {
     return new Promise((resolve) => {
       this.waitingToSettle.push(resolve);
@@ -305,20 +307,28 @@ export class Viewer {
       else if (!this.isTouched) this.goTo(this.view);
       else this.changed();
       options.onScene?.(message.info);
+    } else if (message.kind === "counts") {
+      if (!this.info) return;
+      const { anchors, coupled } = message;
+      this.info = { ...this.info, anchors, coupled };
+      options.onScene?.(this.info);
     } else if (!renderer) return;
-    else if (message.kind === "geometry") this.setGeometry(renderer, message.planes, message.rows);
-    else if (this.hasSplats) {
-      if (message.appearance) renderer.setAppearance(message.appearance, message.firstRow);
+    else if (message.kind === "reserve") this.reserve(renderer, message.rows);
+    else if (!this.hasSplats) return;
+    else if (message.kind === "geometry") renderer.setGeometry(message.planes, message.rows);
+    else if (message.kind === "appearance") renderer.setAppearance(message.values, message.rows);
+    else {
       renderer.setOrder(message.order);
       if (message.settled) this.settledId = message.id;
+      if (message.sharp) this.sharpId = message.id;
       this.fit();
       this.draw();
     }
   }
 
-  private setGeometry(renderer: Renderer, planes: Float32Array<ArrayBuffer>, rows: number): void {
+  private reserve(renderer: Renderer, rows: number): void {
     try {
-      renderer.setGeometry(planes, rows);
+      renderer.reserve(rows);
       this.hasSplats = true;
     } catch (error) {
       this.hasSplats = false;
@@ -338,7 +348,7 @@ export class Viewer {
     if (!canvas) return;
     const isUnfinished = this.isMoving || this.settledId !== this.eyeId;
     const share = isUnfinished ? this.pace.share : 1;
-    const ratio = share * Math.min(devicePixelRatio, MOST_PIXELS_PER_CSS_PIXEL);
+    const ratio = share * this.ratio;
     const width = fixed ? fixed.width : Math.max(1, Math.round(stage.clientWidth * ratio));
     const height = fixed ? fixed.height : Math.max(1, Math.round(stage.clientHeight * ratio));
     if (canvas.width !== width) canvas.width = width;
@@ -355,9 +365,27 @@ export class Viewer {
     this.eyeId++;
     this.send({
       kind: "eye",
-      eye: { id: this.eyeId, centre: [along(0), along(1), along(2)], axis: [r[6]!, r[7]!, r[8]!] },
+      eye: {
+        id: this.eyeId,
+        centre: [along(0), along(1), along(2)],
+        axis: [r[6]!, r[7]!, r[8]!],
+        sight: this.sightOf(camera, [along(0), along(1), along(2)]),
+      },
     });
     this.draw();
+  }
+
+  /** What a camera takes in at rest: pictures may be smaller just now. */
+  private sightOf({ rotation, fx, fy }: FrameCamera, centre: Vector): Sight {
+    const { width, height } = this.canvas!;
+    const whole = this.fixed ? width : this.stage.clientWidth * this.ratio;
+    const grow = Math.max(1, whole / width);
+    return { centre, rotation, width: grow * width, height: grow * height, fx: grow * fx, fy: grow * fy };
+  }
+
+  /** Pixels of a sharp picture in a CSS pixel. */
+  private get ratio(): number {
+    return Math.min(devicePixelRatio, MOST_PIXELS_PER_CSS_PIXEL);
   }
 
   private draw(): void {
@@ -369,7 +397,7 @@ export class Viewer {
       const camera = this.frameCamera();
       if (!camera) return;
       if (this.renderer) this.drawNow(this.renderer, camera);
-      if (this.settledId === this.eyeId) for (const resolve of this.waitingToSettle.splice(0)) resolve();
+      if (this.sharpId === this.eyeId) for (const resolve of this.waitingToSettle.splice(0)) resolve();
     });
   }
 

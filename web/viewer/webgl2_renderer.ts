@@ -1,6 +1,6 @@
 /** Draws splats with WebGL2. Sums are kept in 16-bit floats where the browser can: 8 bits lose faint splats. */
 
-import { CannotDraw, type FrameCamera, type Renderer, tooManySplats } from "./renderer.ts";
+import { CannotDraw, type FrameCamera, type Renderer, runsOf, tooManySplats } from "./renderer.ts";
 import { PLANES, ROW, dilationOf } from "./splatting.ts";
 import { SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX } from "./webgl2_shaders.ts";
 
@@ -47,7 +47,7 @@ export class WebGL2Renderer implements Renderer {
     gl.bindVertexArray(null);
   }
 
-  setGeometry(planes: Float32Array, rows: number): void {
+  reserve(rows: number): void {
     const { gl } = this;
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE) as number;
     if (PLANES * rows > most) throw tooManySplats(Math.floor(most / PLANES) * ROW);
@@ -56,15 +56,40 @@ export class WebGL2Renderer implements Renderer {
     this.rows = rows;
     this.drawn = 0;
     this.geometry = newTexture(gl, gl.RGBA32F, ROW, PLANES * rows);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, PLANES * rows, gl.RGBA, gl.FLOAT, planes);
     this.appearance = newTexture(gl, gl.RGBA32F, ROW, rows);
   }
 
-  setAppearance(values: Float32Array, firstRow: number): void {
+  setGeometry(planes: Float32Array, rows: readonly number[]): void {
+    this.gl.bindTexture(this.gl.TEXTURE_2D, this.geometry);
+    for (let plane = 0; plane < PLANES; plane++) {
+      const first = plane * rows.length;
+      this.setRows(planes, rows, first, plane * this.rows);
+    }
+  }
+
+  setAppearance(values: Float32Array, rows: readonly number[]): void {
+    this.gl.bindTexture(this.gl.TEXTURE_2D, this.appearance);
+    this.setRows(values, rows, 0, 0);
+  }
+
+  /** Into the texture at hand, the rows of `values` from `first` on, so many rows `below` their places. */
+  private setRows(values: Float32Array, rows: readonly number[], first: number, below: number): void {
     const { gl } = this;
-    const rows = values.length / (4 * ROW);
-    gl.bindTexture(gl.TEXTURE_2D, this.appearance);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, firstRow, ROW, rows, gl.RGBA, gl.FLOAT, values);
+    for (const run of runsOf(rows)) {
+      const from = 4 * ROW * (first + run.at);
+      gl.texSubImage2D(
+        gl.TEXTURE_2D,
+        0,
+        0,
+        below + run.first,
+        ROW,
+        run.count,
+        gl.RGBA,
+        gl.FLOAT,
+        values,
+        from,
+      );
+    }
   }
 
   setOrder(order: Uint32Array): void {

@@ -1,6 +1,6 @@
 /** Draws splats with WebGPU. Sums are kept in 16-bit floats: 8 bits lose faint splats. */
 
-import { CannotDraw, type FrameCamera, type Renderer, tooManySplats } from "./renderer.ts";
+import { CannotDraw, type FrameCamera, type Renderer, runsOf, tooManySplats } from "./renderer.ts";
 import { PLANES, ROW, dilationOf } from "./splatting.ts";
 import { SHADERS, VIEW } from "./webgpu_shaders.ts";
 
@@ -20,6 +20,7 @@ interface Splats {
   geometry: GPUBuffer;
   appearance: GPUBuffer;
   bindings: GPUBindGroup;
+  rows: number;
 }
 
 /** What is of one size of the picture. */
@@ -72,22 +73,42 @@ export class WebGPURenderer implements Renderer {
     return new WebGPURenderer(canvas, context, device, pipelines);
   }
 
-  setGeometry(planes: Float32Array<ArrayBuffer>, rows: number): void {
+  reserve(rows: number): void {
     const { device } = this;
     const { maxBufferSize, maxStorageBufferBindingSize } = device.limits;
     const most = Math.floor(Math.min(maxBufferSize, maxStorageBufferBindingSize) / (PLANES * BYTES));
     if (ROW * rows > most) throw tooManySplats(most);
     this.dropSplats();
     const usage = GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_DST;
-    const geometry = device.createBuffer({ size: planes.byteLength, usage });
+    const geometry = device.createBuffer({ size: PLANES * BYTES * ROW * rows, usage });
     const appearance = device.createBuffer({ size: BYTES * ROW * rows, usage });
-    device.queue.writeBuffer(geometry, 0, planes);
     const bindings = this.bind(this.pipelines.splats, [this.view, geometry, appearance]);
-    this.splats = { geometry, appearance, bindings };
+    this.splats = { geometry, appearance, bindings, rows };
   }
 
-  setAppearance(values: Float32Array<ArrayBuffer>, firstRow: number): void {
-    if (this.splats) this.device.queue.writeBuffer(this.splats.appearance, BYTES * ROW * firstRow, values);
+  setGeometry(planes: Float32Array<ArrayBuffer>, rows: readonly number[]): void {
+    const { splats } = this;
+    if (!splats) return;
+    for (let plane = 0; plane < PLANES; plane++)
+      this.setRows(splats.geometry, planes, rows, plane * rows.length, plane * splats.rows);
+  }
+
+  setAppearance(values: Float32Array<ArrayBuffer>, rows: readonly number[]): void {
+    if (this.splats) this.setRows(this.splats.appearance, values, rows, 0, 0);
+  }
+
+  /** The rows of `values` from `first` on, so many rows `behind` their places. */
+  private setRows(
+    buffer: GPUBuffer,
+    values: Float32Array<ArrayBuffer>,
+    rows: readonly number[],
+    first: number,
+    behind: number,
+  ): void {
+    for (const run of runsOf(rows)) {
+      const [from, count] = [4 * ROW * (first + run.at), 4 * ROW * run.count];
+      this.device.queue.writeBuffer(buffer, BYTES * ROW * (behind + run.first), values, from, count);
+    }
   }
 
   setOrder(order: Uint32Array<ArrayBuffer>): void {

@@ -1,31 +1,25 @@
-/** The worker: decodes a file as it arrives, predicts its splats, and sorts them for the camera at hand. */
+/** The worker: decodes a scene as it arrives, predicts its splats, and sorts them for the camera at hand. */
 
 import { chooseKernels } from "../src/choose_kernels.ts";
 import type { Kernels } from "../src/codec/kernels.ts";
 import type { Scene } from "../src/codec/scene_decoder.ts";
-import { type Appearance, OPACITY_CUTOFF, Predictor } from "../src/prediction/predictor.ts";
+import { Predictor } from "../src/prediction/predictor.ts";
 import { ProgressiveDecoder } from "../src/progressive.ts";
 import { sceneInfo } from "../src/scene_info.ts";
-import { DepthOrder } from "./depth_order.ts";
+import { isInView } from "../src/tiles/detail.ts";
+import { TileLoader } from "../src/tiles/loader.ts";
+import { type Manifest, isManifest, readManifest } from "../src/tiles/manifest.ts";
+import { countsOf, sphereCentres, tilesInfo } from "../src/tiles/scene_info.ts";
 import { firstView } from "./first_view.ts";
 import type { Eye, FromWorker, ToWorker } from "./messages.ts";
-import { distanceAlong } from "./pick.ts";
-import { appearanceRows, geometryPlanes, rowsOf } from "./splat_planes.ts";
-import { NEAR } from "./splatting.ts";
+import { rowsOf } from "./splat_planes.ts";
+import { SplatStore } from "./splat_store.ts";
 
-/** Coupled primitives whose opacity and color follow the camera in one frame. */
-const PART = 50_000;
 /** Bytes by which a file that is no .cgs file is known. */
-const HEAD = 16;
+const HEAD = 32;
 const NO_BYTES = new Uint8Array(0);
-
-interface Shown {
-  predictor: Predictor;
-  appearance: Appearance;
-  /** Anchor with which the next part begins, and anchors that have not seen the camera yet. */
-  nextAnchor: number;
-  remaining: number;
-}
+/** Tiles that may begin a row of their own; scenes of more show fewer than that at a time. */
+const MOST_PARTS = 2048;
 
 declare const self: {
   onmessage: ((event: MessageEvent<ToWorker>) => void) | null;
@@ -33,39 +27,45 @@ declare const self: {
 };
 
 const kernels = chooseKernels();
-const depthOrder = new DepthOrder();
-let shown: Shown | null = null;
+/** Of the scene that is shown. */
+let store = newStore();
+let tiles: TileLoader | null = null;
+let isOfTiles = false;
 let eye: Eye | null = null;
-let isStale = false;
-let isScheduled = false;
 /** Files opened so far: what an earlier one still has to say is dropped. */
 let opened = 0;
 
 self.onmessage = ({ data }) => {
   if (data.kind === "bytes") openBytes(data.bytes, data.most);
-  else if (data.kind === "url") void openUrl(++opened, data.url, data.most);
-  else if (data.kind === "eye") setEye(data.eye);
+  else if (data.kind === "url") void openUrl(begin(), data.url, data.most);
+  else if (data.kind === "eye") look(data.eye);
   else if (data.kind === "pick") pick(data);
-  else if (shown) present(shown);
+  else store.again();
 };
 
-function pick({ id, origin, direction, pixel }: Extract<ToWorker, { kind: "pick" }>): void {
-  const { predictor, appearance } = shown!;
-  const { opacities } = appearance;
-  const distance = distanceAlong(origin, direction, pixel, predictor.geometry, opacities, NEAR);
-  self.postMessage({ kind: "picked", id, distance });
+function newStore(isSharp?: () => boolean, isSeen?: (tile: number) => boolean): SplatStore {
+  return new SplatStore((message, transfer) => self.postMessage(message, transfer), isSharp, isSeen);
 }
 
-function setEye(next: Eye): void {
-  const moved = !eye || next.centre.some((x, axis) => x !== eye!.centre[axis]);
+function pick({ id, origin, direction, pixel }: Extract<ToWorker, { kind: "pick" }>): void {
+  self.postMessage({ kind: "picked", id, distance: store.distanceAlong(origin, direction, pixel) });
+}
+
+function look(next: Eye): void {
   eye = next;
-  isStale = true;
-  if (shown && moved) shown.remaining = shown.predictor.primitives.anchors;
-  schedule();
+  tiles?.look(next.sight);
+  store.look(next);
+}
+
+/** A number for the file that is opened now. */
+function begin(): number {
+  tiles?.dispose();
+  tiles = null;
+  return ++opened;
 }
 
 function openBytes(bytes: ArrayBuffer, most: number): void {
-  void open(++opened, streamOf(new Uint8Array(bytes)), bytes.byteLength, most);
+  void open(begin(), streamOf(new Uint8Array(bytes)), bytes.byteLength, most);
 }
 
 async function openUrl(ticket: number, url: string, most: number): Promise<void> {
@@ -77,7 +77,8 @@ async function openUrl(ticket: number, url: string, most: number): Promise<void>
     });
     if (!response.ok) throw new Error(`${url}: the server answers ${response.status} ${response.statusText}`);
     const length = Number(response.headers.get("Content-Length")) || null;
-    await open(ticket, response.body!, response.headers.get("Content-Encoding") ? null : length, most);
+    const total = response.headers.get("Content-Encoding") ? null : length;
+    await open(ticket, response.body!, total, most, response.url || url);
   } catch (error) {
     report(ticket, error, NO_BYTES);
   }
@@ -92,11 +93,13 @@ function streamOf(bytes: Uint8Array): ReadableStream<Uint8Array> {
   });
 }
 
+/** `base`: the address that the bytes are of, if they have one. */
 async function open(
   ticket: number,
   stream: ReadableStream<Uint8Array>,
   total: number | null,
   most: number,
+  base?: string,
 ): Promise<void> {
   let head = NO_BYTES;
   try {
@@ -108,7 +111,14 @@ async function open(
       const { done, value } = await reader.read();
       if (ticket !== opened) return;
       if (done) break;
-      if (!loaded) head = value.slice(0, HEAD);
+      if (!loaded) {
+        head = value.slice(0, HEAD);
+        if (base && isManifest(text(value))) {
+          const manifest = readManifest(text(await restOf(reader, value)));
+          if (ticket === opened) openTiles(ticket, manifest, base, most, chosen);
+          return;
+        }
+      }
       loaded += value.length;
       const isFiner = decoder.push(value);
       self.postMessage({ kind: "progress", loaded, total: total ?? decoder.expectedBytes });
@@ -125,6 +135,19 @@ async function open(
   }
 }
 
+function text(bytes: Uint8Array): string {
+  return new TextDecoder().decode(bytes);
+}
+
+async function restOf(
+  reader: ReadableStreamDefaultReader<Uint8Array>,
+  first: Uint8Array,
+): Promise<Uint8Array> {
+  const pieces = [first];
+  for (let next = await reader.read(); !next.done; next = await reader.read()) pieces.push(next.value);
+  return new Uint8Array(await new Blob(pieces as BlobPart[]).arrayBuffer());
+}
+
 function report(ticket: number, error: unknown, head: Uint8Array): void {
   if (ticket !== opened) return;
   const { name, message } = error instanceof Error ? error : new Error(String(error));
@@ -133,69 +156,53 @@ function report(ticket: number, error: unknown, head: Uint8Array): void {
 
 function show(scene: Scene, chosen: Kernels): void {
   const predictor = new Predictor(scene, chosen);
-  shown = { predictor, appearance: predictor.newAppearance(), nextAnchor: 0, remaining: 0 };
   const info = sceneInfo(scene, predictor);
   const first = firstView(predictor.positions, info.viewpoints, info.extent);
-  self.postMessage({ kind: "scene", info, first });
-  present(shown);
-}
-
-/** Everything that a renderer needs to draw a scene that it has nothing of. */
-function present(scene: Shown): void {
-  const { geometry, primitives } = scene.predictor;
-  scene.nextAnchor = 0;
-  scene.remaining = primitives.anchors;
-  const planes = geometryPlanes(geometry);
-  const rows = rowsOf(geometry.sound.length);
-  // Splats take the place of others in full: their first frame comes with them.
-  const frame = eye && frameOf(scene, eye, Infinity);
-  self.postMessage({ kind: "geometry", planes, rows }, [planes.buffer]);
-  if (frame) post(frame);
-}
-
-/** One frame at a time, with room for messages in between. */
-function schedule(): void {
-  if (isScheduled || !shown || !eye || !(isStale || shown.remaining)) return;
-  isScheduled = true;
-  setTimeout(() => {
-    isScheduled = false;
-    isStale = false;
-    post(frameOf(shown!, eye!, PART));
-    schedule();
-  }, 0);
-}
-
-interface Frame {
-  message: FromWorker;
-  transfer: Transferable[];
-}
-
-/** What is drawn for an eye, after at most `part` more coupled primitives have seen it. */
-function frameOf(scene: Shown, { id, centre, axis }: Eye, part: number): Frame {
-  const { predictor, appearance } = scene;
-  let rows: { values: Float32Array<ArrayBuffer>; firstRow: number } | null = null;
-  if (scene.remaining) {
-    const { firstCoupled, anchors } = predictor.primitives;
-    const first = scene.nextAnchor;
-    const most = Math.min(anchors, first + scene.remaining);
-    let end = first + 1;
-    while (end < most && firstCoupled[end + 1]! - firstCoupled[first]! <= part) end++;
-    predictor.predictAppearance(centre, appearance, first, end);
-    rows = appearanceRows(appearance, firstCoupled[first]!, firstCoupled[end]!);
-    scene.nextAnchor = end % anchors;
-    scene.remaining -= end - first;
+  if (isOfTiles) {
+    store = newStore();
+    if (eye) store.look(eye);
+    isOfTiles = false;
   }
-  const { means, sound } = predictor.geometry;
-  const shift = -(axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2]);
-  const order = depthOrder.sort(means, appearance.opacities, sound, axis, shift, OPACITY_CUTOFF, NEAR);
-  const settled = scene.remaining === 0;
-  const [values, firstRow] = rows ? [rows.values, rows.firstRow] : [null, 0];
-  return {
-    message: { kind: "frame", id, order, appearance: values, firstRow, settled },
-    transfer: [order.buffer, ...(values ? [values.buffer] : [])],
-  };
+  self.postMessage({ kind: "scene", info, first });
+  store.replace(predictor);
 }
 
-function post({ message, transfer }: Frame): void {
-  self.postMessage(message, transfer);
+/** Shows a scene of tiles: at first nothing but where it is, then what the camera needs. */
+function openTiles(ticket: number, manifest: Manifest, base: string, most: number, chosen: Kernels): void {
+  const levels = new Int32Array(manifest.tiles.length);
+  const loader = new TileLoader(manifest, base, {
+    kernels: chosen,
+    most,
+    onTile(tile, scene, shift, level) {
+      levels[tile] = level;
+      if (scene) parts.set(tile, new Predictor(scene, chosen), shift);
+      else parts.delete(tile);
+      self.postMessage({ kind: "counts", ...countsOf(manifest, levels) });
+    },
+    onProgress() {
+      self.postMessage({ kind: "progress", loaded: loader.loaded, total: loader.loaded + loader.missing });
+    },
+    onSharp() {
+      self.postMessage({ kind: "complete", bytes: loader.loaded });
+      parts.touch();
+    },
+    onError: (error) => report(ticket, error, NO_BYTES),
+  });
+  const parts = newStore(
+    () => loader.isSharp,
+    (tile) => !eye || isInView(manifest.tiles[tile]!, eye.sight),
+  );
+  const info = tilesInfo(manifest);
+  // Eyes of an earlier scene say nothing about this one.
+  eye = null;
+  self.postMessage({
+    kind: "scene",
+    info,
+    first: firstView(sphereCentres(manifest), info.viewpoints, info.extent),
+  });
+  const whole = manifest.tiles.map((tile) => tile.levels.at(-1)!.coupled);
+  // Each tile begins a row, and some may be there twice for a moment.
+  const spare = Math.min(MOST_PARTS, whole.length) + 2 * rowsOf(Math.max(...whole));
+  parts.reserve(rowsOf(Math.min(most, info.totalCoupled)) + spare);
+  [store, tiles, isOfTiles] = [parts, loader, true];
 }

@@ -78,6 +78,7 @@ class RangeInfo:
     level: int  # of the octree
     anchors: int  # up to this level
     bytes: int  # of the file up to here
+    coupled: int  # coupled primitives up to this level
 
 
 @dataclass(frozen=True)
@@ -330,17 +331,17 @@ def file_info(data: bytes) -> FileInfo:
     streams = [0] * len(names)
     sizes: list[tuple[str, int]] = []
     ranges: list[RangeInfo] = []
-    at, anchors, heads = container_bytes(len(sections)), 0, 0
+    at, anchors, coupled, heads = container_bytes(len(sections)), 0, 0, 0
     for section in sections:
         at += len(section.data)
         if section.number != LATENTS:
             sizes.append((section.name, len(section.data)))
             continue
         head, parts = stream_sizes(section.data, scene.dimensions)
-        anchors += head.anchors
+        anchors, coupled = anchors + head.anchors, coupled + head.coupled
         heads += len(section.data) - sum(parts)
         streams = [a + b for a, b in zip(streams, parts, strict=True)]
-        ranges.append(RangeInfo(head.level, anchors, at))
+        ranges.append(RangeInfo(head.level, anchors, at, coupled))
     sizes += [*zip(names, streams, strict=True), ("container", container_bytes(len(sections)) + heads)]
     return FileInfo(
         version=version_of(data),

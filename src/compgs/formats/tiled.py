@@ -5,6 +5,7 @@ sees it. It is checked as a whole by a checksum before any of it is believed, an
 """
 
 import hashlib
+import itertools
 import json
 import math
 import re
@@ -30,6 +31,7 @@ VERSION = 1
 MOST_BYTES = 1 << 28  # of a manifest
 MOST_TILES = 1 << 16
 MOST_SPHERES = 1 << 10  # of a tile
+MOST_LEVELS = 1 << 5  # of a tile
 MOST_NUMBER = 1e30  # of any coordinate or radius: squares stay finite in double precision, sums in single
 MOST_SIDE = 1 << 20  # pixels
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
@@ -50,6 +52,15 @@ class Core:
     high: tuple[float, float]
 
 
+@dataclass(frozen=True)
+class Level:
+    """A beginning of a tile's file that is a scene."""
+
+    bytes: int
+    anchors: int  # that are in it
+    coupled_primitives: int  # that are in it
+
+
 @dataclass(frozen=True, eq=False)
 class TileEntry:
     """A tile, as the manifest has it. Its file is `<name>.cgs`, beside the manifest."""
@@ -65,6 +76,7 @@ class TileEntry:
         np.ndarray
     )  # [G, 4] float64: centre, counted from the manifest's world offset, and radius; world units
     core: Core | None = None  # None: of a tile that was not cut
+    levels: tuple[Level, ...] = ()  # from coarse to fine, without the whole file
 
     @property
     def file(self) -> str:
@@ -219,6 +231,7 @@ def _tile_entry(tile: TileEntry) -> dict[str, Any]:
         "memory": tile.memory,
         "world_offset": list(tile.world_offset),
         "core": None if tile.core is None else core_entry(tile.core),
+        "levels": [[level.bytes, level.anchors, level.coupled_primitives] for level in tile.levels],
         "spheres": [[shortened(value, 7) for value in row] for row in tile.spheres.tolist()],
     }
 
@@ -302,17 +315,37 @@ def _tile(entry: dict[str, Any]) -> TileEntry:
     if not isinstance(sha256, str) or not re.fullmatch("[0-9a-f]{64}", sha256):
         raise ValueError(f"tile {name}: its hash is {sha256!r:.80}")
     core = entry["core"]
+    whole = Level(*(_count(entry[name]) for name in ("bytes", "anchors", "coupled_primitives")))
     return TileEntry(
         name=name,
-        bytes=_count(entry["bytes"]),
+        bytes=whole.bytes,
         sha256=sha256,
-        anchors=_count(entry["anchors"]),
-        coupled_primitives=_count(entry["coupled_primitives"]),
+        anchors=whole.anchors,
+        coupled_primitives=whole.coupled_primitives,
         memory=_count(entry["memory"]),
         world_offset=_vector(entry["world_offset"]),
         spheres=spheres,
         core=None if core is None else core_from_entry(core),
+        levels=_levels(entry.get("levels", []), whole),
     )
+
+
+def _levels(values: Any, whole: Level) -> tuple[Level, ...]:
+    """None in manifests from before tiles had them. Each is more than the one before, and the whole more than all."""
+    levels = _list(values, 0, MOST_LEVELS, _level)
+    for one, finer in itertools.pairwise((*levels, whole)):
+        if not (
+            one.bytes < finer.bytes
+            and one.anchors < finer.anchors
+            and one.coupled_primitives <= finer.coupled_primitives
+        ):
+            raise ValueError(f"a level of {one} before one of {finer}")
+    return levels
+
+
+def _level(values: Any) -> Level:
+    size, anchors, coupled = values
+    return Level(_count(size), _count(anchors), _count(coupled, least=0))
 
 
 def _sphere(values: Any) -> tuple[float, ...]:
@@ -343,8 +376,8 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-def _count(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value < 1 << 48:
+def _count(value: Any, least: int = 1) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 1 << 48:
         raise ValueError(f"expected a count, found {value!r:.80}")
     return value
 

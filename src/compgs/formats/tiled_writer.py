@@ -11,8 +11,19 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.codec.decoder import decode_bytes
+from compgs.codec.reader import file_info
 from compgs.errors import ConfigError, OutputError
-from compgs.formats.tiled import MANIFEST, MOST_NUMBER, NAME, Core, GroundAxes, Manifest, TileEntry, Vector
+from compgs.formats.tiled import (
+    MANIFEST,
+    MOST_NUMBER,
+    NAME,
+    Core,
+    GroundAxes,
+    Level,
+    Manifest,
+    TileEntry,
+    Vector,
+)
 from compgs.formats.tiled_scene import resident_bytes
 from compgs.model.hybrid_model import HybridModel
 from compgs.outputs import write_bytes
@@ -105,6 +116,11 @@ def _entry(tile: NewTile, model: HybridModel) -> TileEntry:
         world_offset=model.world_offset,
         spheres=spheres(*model.bounds),
         core=tile.core,
+        levels=tuple(
+            Level(part.bytes, part.anchors, part.coupled)
+            for part in file_info(tile.data).ranges
+            if 0 < part.anchors < model.anchors
+        ),
     )
 
 

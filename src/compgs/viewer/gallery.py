@@ -1,6 +1,9 @@
 """A web server for a folder of .cgs files: a list of them with pictures, the page that shows one, and their bytes.
 
-Only .cgs files within the folder are served, nothing else of the machine; links that lead out of it are not followed.
+A scene of tiles is one in the list; the page fetches its manifest and, of its tiles, what is looked at.
+
+Only .cgs files and manifests of tiles within the folder are served, nothing else of the machine; links that lead out of
+it are not followed.
 """
 
 import html
@@ -12,6 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
+from compgs.formats import tiled
 from compgs.viewer.page import html_page
 from compgs.viewer.thumbnails import Thumbnails
 from compgs.words import short_size
@@ -84,8 +88,14 @@ def gallery_server(folder: Path, host: str, port: int) -> ThreadingHTTPServer:
 
 
 def scene_files(folder: Path) -> list[Path]:
-    """The .cgs files in a folder and below, by name; those that links lead out of it to are not among them."""
-    return sorted(path for path in folder.rglob(f"*{SUFFIX}") if _is_served(path, folder))
+    """The .cgs files and the manifests of tiles in a folder and below, by name, without the tiles.
+
+    Those that links lead out of it to are not among them.
+    """
+    manifests = {path for path in folder.rglob(tiled.MANIFEST) if _is_served(path, folder)}
+    tiles = {path.parent for path in manifests}
+    files = {path for path in folder.rglob(f"*{SUFFIX}") if _is_served(path, folder)}
+    return sorted(manifests | {path for path in files if path.parent not in tiles})
 
 
 def gallery_page(folder: Path, thumbnails: Thumbnails) -> bytes:
@@ -98,9 +108,21 @@ def gallery_page(folder: Path, thumbnails: Thumbnails) -> bytes:
 def scene_page(query: str) -> bytes:
     """UTF-8 of the page that shows the file which its address names (`?url=`)."""
     (address,) = parse_qs(query).get("url", ["compgs"])[:1]
-    name = unquote(address).removeprefix(FILES).removesuffix(SUFFIX)
+    name = scene_title(unquote(address).removeprefix(FILES))
     before, end, after = html_page(b"", name).rpartition(b"</body>")
     return before + WAY_BACK + after if end else after
+
+
+def scene_title(relative: str) -> str:
+    """What a scene is called, by the path of its file or manifest in the folder."""
+    place = relative.removesuffix(f"/{tiled.MANIFEST}")
+    return place.removesuffix(SUFFIX if place == relative else tiled.SUFFIX)
+
+
+def _bytes_of(path: Path) -> int:
+    """Bytes of a file; of a manifest, of all its tiles, too."""
+    beside = path.parent.glob(f"*{SUFFIX}") if path.name == tiled.MANIFEST else ()
+    return path.stat().st_size + sum(file.stat().st_size for file in beside)
 
 
 def _items(folder: Path, thumbnails: Thumbnails) -> Iterator[str]:
@@ -110,7 +132,7 @@ def _items(folder: Path, thumbnails: Thumbnails) -> Iterator[str]:
         except OSError:  # it has gone meanwhile
             continue
         relative = path.relative_to(folder).as_posix()
-        name, size = html.escape(relative.removesuffix(SUFFIX)), short_size(status.st_size)
+        name, size = html.escape(scene_title(relative)), short_size(_bytes_of(path))
         if trouble is not None:
             yield BROKEN.format(name=name, size=size, trouble=html.escape(trouble))
             continue
@@ -133,11 +155,19 @@ def _hint(folder: Path) -> str:
 
 
 def _is_served(path: Path, folder: Path) -> bool:
-    """Whether it is a .cgs file that lies, links followed, in the folder."""
+    """Whether it is a .cgs file, or a manifest of tiles, that lies, links followed, in the folder."""
     try:
-        return path.suffix == SUFFIX and path.is_file() and path.resolve().is_relative_to(folder)
+        is_named = path.suffix == SUFFIX or path.name == tiled.MANIFEST
+        if not (is_named and path.is_file() and path.resolve().is_relative_to(folder)):
+            return False
+        return path.suffix == SUFFIX or _is_manifest(path)
     except (OSError, ValueError):  # names that no file can have
         return False
+
+
+def _is_manifest(path: Path) -> bool:
+    with path.open("rb") as file:
+        return tiled.begins(file.read(64))
 
 
 class GalleryHandler(BaseHTTPRequestHandler):
@@ -204,7 +234,8 @@ class GalleryHandler(BaseHTTPRequestHandler):
             self.send_response(HTTPStatus.PARTIAL_CONTENT if is_part else HTTPStatus.OK)
             if is_part:
                 self.send_header("Content-Range", f"bytes {wanted.start}-{wanted.stop - 1}/{size}")
-            self.send_header("Content-Type", MEDIA_TYPE)
+            kind = MEDIA_TYPE if path.suffix == SUFFIX else "application/json"
+            self.send_header("Content-Type", kind)
             self.send_header("Accept-Ranges", "bytes")
             self.send_header("Content-Length", str(len(wanted)))
             self.end_headers()
