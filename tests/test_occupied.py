@@ -116,6 +116,7 @@ def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
         ["compress", "GOLDEN", "-o", "FOLDER.cgs"],
         ["evaluate", "GOLDEN", "SCENE", "-o", "FOLDER"],
         ["compare", "GOLDEN", "GOLDEN", "-o", "FOLDER"],
+        ["benchmark", "SUITE", "--data", "DATA", "-o", "FOLDER"],
     ],
     ids=" ".join,
 )
@@ -134,11 +135,21 @@ def test_every_command_that_writes_a_folder_for_minutes_refuses_one_that_is_in_u
         "GOLDEN": Path(__file__).parent / "golden" / "tiny.cgs",
         "PHOTOS": scene_folder / "images",
         "SCENE": scene_folder,
+        "SUITE": suite_of(scene_folder, tmp_path),
+        "DATA": scene_folder.parent,
     }
     with somebody(folder) as first:
         assert main([str(places.get(word, word)) for word in words]) == 1
         assert f"process {first.pid} on " in capsys.readouterr().err
     assert not folder.exists()  # nothing was written
+
+
+def suite_of(scene: Path, folder: Path) -> Path:
+    """A suite of one short run."""
+    path = folder / "suite.toml"
+    scenes = f'[scenes.made]\npath = "{scene.name}"\n'
+    path.write_text(f'title = "Short"\n[train]\nsteps = 1\n{scenes}[methods.short]\nmethod = "compgs"\n')
+    return path
 
 
 @pytest.fixture(scope="module")

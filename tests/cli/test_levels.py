@@ -1,6 +1,7 @@
 """`--level`: which level of detail of a streamed .sog a command opens."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from compgs.formats import SplatArrays, read_ply, sog
 def splats(count: int, seed: int) -> SplatArrays:
     draw = np.random.default_rng(seed).normal
     shapes = (count, 3), (count, 3), (count, 4), (count,), (count, 3), (count, 3, 3)
-    return SplatArrays(*(draw(size=shape).astype(np.float32) for shape in shapes))
+    arrays = SplatArrays(*(draw(size=shape).astype(np.float32) for shape in shapes))
+    return replace(arrays, log_scales=arrays.log_scales / 4 - 2)
 
 
 @pytest.fixture
@@ -58,3 +60,19 @@ def test_a_level_that_is_not_there_is_a_message(
 ) -> None:
     assert main(["export", str(streamed.parent / name), str(tmp_path / "a.ply"), "--level", level]) != 0
     assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_compress_learns_the_level_that_is_asked_for(
+    streamed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "coarse.cgs"
+    options = ["--steps", "4", "--views", "4", "--width", "32", "--set", "model.coupled_primitives=2"]
+    assert main(["compress", str(streamed), "-o", str(output), "--level", "1", *options]) == 0
+    assert "40 splats" in capsys.readouterr().out
+    told = json.loads((tmp_path / "coarse.run" / "results.json").read_text())["compress"]
+    needed = (streamed, tmp_path / "1.sog")
+    assert (told["source_splats"], told["source_bytes"]) == (40, sum(path.stat().st_size for path in needed))
+    assert main(["compress", "-o", str(output), "--resume"]) == 0
+    assert "40 splats" in capsys.readouterr().out
+    assert main(["compress", "-o", str(output), "--resume", "--level", "0"]) != 0
+    assert "--level: --resume continues with what the run began with" in capsys.readouterr().err

@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError
-from compgs.evaluation.camera_path import between, camera_entry, look_at, orbit, read_cameras
+from compgs.evaluation.camera_path import (
+    USUAL_DISTANCE,
+    between,
+    camera_entry,
+    distance_of_all,
+    look_at,
+    orbit,
+    read_cameras,
+    whole,
+)
 
 GOOD = camera_entry(Camera(np.eye(4), 100.0, 101.0, 32.0, 24.0, 64, 48), "a view")
 
@@ -151,3 +160,29 @@ def test_the_circle_is_around_three_quarters_of_the_positions() -> None:
         away = camera.center - middle
         assert np.linalg.norm(away) == pytest.approx(2.0, rel=0.05)
         assert -away[1] == pytest.approx(1.0, rel=0.1)  # up is -y
+
+
+def share_in_view(positions: np.ndarray, cameras: list[tuple[str, Camera]]) -> float:
+    """The least of the shares of positions that the cameras have in their pictures."""
+    shares = []
+    for _, camera in cameras:
+        x, y, depth = camera.rotation @ positions.T + camera.translation[:, None]
+        u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+        inside = (depth > 0) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+        shares.append(float(inside.mean()))
+    return min(shares)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (300, 900)])
+def test_an_object_is_whole_in_the_pictures_and_a_capture_is_seen_from_where_it_was(
+    size: tuple[int, int],
+) -> None:
+    width, height = size
+    tall = np.random.default_rng(0).uniform(-1, 1, (3000, 3)) * (0.3, 1.0, 0.3) + (5, 6, 7)
+    at = {"width": width, "height": height}
+    assert share_in_view(tall, whole(tall, frames=12, **at)) > 0.98
+    distance = distance_of_all(tall, **at)
+    if distance > USUAL_DISTANCE:
+        assert share_in_view(tall, orbit(tall, frames=12, **at, distance=0.8 * distance)) < 0.98
+    far = np.random.default_rng(1).normal(size=(600, 3)) * 40
+    assert distance_of_all(np.concatenate([tall, far]), **at) == USUAL_DISTANCE

@@ -4,6 +4,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,19 @@ def test_the_finest_level_and_the_environment_are_opened(scene: Path) -> None:
     assert open_scene(scene).counts == {"splats": 13}
     needed = ["lod-meta.json", "0_0.sog", "0_1.sog", "env.sog"]
     assert sum(component_bytes(scene).values()) == sum((scene.parent / n).stat().st_size for n in needed)
+    needed = ["lod-meta.json", "1_0.sog", "env.sog"]
+    assert sum(component_bytes(scene, 1).values()) == sum((scene.parent / n).stat().st_size for n in needed)
+
+
+def test_parts_that_disagree_about_antialiasing_are_drawn_as_the_first_says(
+    scene: Path, made: Callable[..., SplatArrays], caplog: pytest.LogCaptureFixture
+) -> None:
+    assert not sog_streamed.read(scene).antialiased and not caplog.messages
+    count, degree = PARTS["0_1.sog"]
+    (scene.parent / "0_1.sog").write_bytes(sog.encoded(replace(made(count, degree, 1), antialiased=True)))
+    assert not sog_streamed.read(scene).antialiased
+    (told,) = caplog.messages
+    assert "0_0.sog is not antialiased, 0_1.sog antialiased: all of them are drawn not antialiased" in told
 
 
 def test_another_level_is_opened_where_it_is_asked_for(scene: Path) -> None:

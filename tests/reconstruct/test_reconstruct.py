@@ -1,12 +1,14 @@
 """From photographs to poses: compared with the poses the photographs were computed from."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from compgs.cli.main import main
 from compgs.errors import ConfigError, MissingDependency, OutputError, SceneError
 from compgs.reconstruct import Reconstruction, ReconstructOptions, reconstruct
 from compgs.scene import load_scene
@@ -74,6 +76,25 @@ def test_photographs_that_cannot_be_joined_leave_nothing_behind(tmp_path: Path) 
     with pytest.raises(SceneError, match="no two of its 3 photographs could be joined"):
         reconstruct(photos, tmp_path / "scene")
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+@pytest.mark.parametrize("others", [0, 3])
+def test_few_photographs_that_are_joined_are_warned_of(
+    walls: Walls, tmp_path: Path, capsys: pytest.CaptureFixture[str], others: int
+) -> None:
+    photos = tmp_path / "photos"
+    shutil.copytree(walls.folder, photos)
+    for index in range(others):
+        noise = np.random.default_rng(index).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+        Image.fromarray(noise).resize((400, 300)).save(photos / f"zz_{index}.png")
+    words = ["reconstruct", str(photos), "-o", str(tmp_path / "scene"), "--features", "600"]
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    told = " ".join((captured.out + captured.err).split())
+    count = len(walls.centers)
+    assert f"{count} of {count + others} photographs have a pose" in told
+    assert ("warning: only 7 of 10 photographs have a pose" in told) == (others == 3)
+    assert ("--features 8192 may join more" in told) == (others == 3)
 
 
 def test_pinhole_images_come_out_where_they_are_asked_for(walls: Walls, tmp_path: Path) -> None:

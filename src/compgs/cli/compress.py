@@ -11,6 +11,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from compgs.cli.command import NO_DEFAULT, ComputingCommand
 from compgs.cli.console import console, say, warn
+from compgs.cli.levels import LevelOption
 from compgs.cli.progress import counting, training
 from compgs.cli.settings import assigned, with_settings
 from compgs.cli.sizes import parse_size, parse_time
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compress(ComputingCommand):
+class Compress(ComputingCommand, LevelOption):
     """Write splats as a small .cgs file, without photographs, and compare it with them.
 
     Places are found from which there is something to see, around the scene and inside it; the splats are rendered
@@ -40,6 +41,8 @@ class Compress(ComputingCommand):
     compgs compress scene.ply -o scene.cgs --time 5min
 
     compgs compress scene.spz -o small.cgs --target-size 200kB --cameras scenes/garden
+
+    compgs compress city/lod-meta.json -o city.cgs --level 2
 
     compgs compress -o scene.cgs --resume
     """
@@ -147,7 +150,7 @@ class Compress(ComputingCommand):
                     "no splats were given: name their file, as in `compgs compress FILE -o OUT.cgs`"
                 )
             return
-        for name in ("preset", "time", "views", "width", "cameras", "up", "background"):
+        for name in ("preset", "time", "views", "width", "cameras", "up", "background", "level"):
             if getattr(self, name) != getattr(Compress, name):
                 raise UsageError(f"--{name}: --resume continues with what the run began with; leave it out")
         for option in self.assignments():
@@ -195,6 +198,7 @@ class Compress(ComputingCommand):
             up=self.up,
             background=self.background,
             cameras=None if self.cameras is None else str(self.cameras),
+            level=self.level,
         )
 
     def assignments(self) -> tuple[str, ...]:

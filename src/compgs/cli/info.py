@@ -73,9 +73,11 @@ class Info(JsonOption, Command, SceneFileOrRunArgument):
 def tell_splats(path: Path, *, json: bool) -> None:
     """Say what is in a file of another format. Raises SplatFileError, MissingDependency."""
     from compgs.formats import check_scene, component_bytes, format_of, open_scene
+    from compgs.model.splats import SplatModel
 
     check_scene(path)
-    components, primitives = component_bytes(path), len(open_scene(path).bounds[1])
+    model = open_scene(path)
+    components, primitives = component_bytes(path), len(model.bounds[1])
     whole, name = sum(components.values()), format_of(path).name
     if json:
         print_json(
@@ -89,7 +91,7 @@ def tell_splats(path: Path, *, json: bool) -> None:
         )
         return
     say(f"{path}: {size(whole)} ({whole:,} bytes), .{name}")
-    say(f"{primitives:,} splats or anchors")
+    say(f"{primitives:,} {'splats' if isinstance(model, SplatModel) else 'anchors'}")
     console.print()
     print_shares(components, {"bits each": primitives})
 

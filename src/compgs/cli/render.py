@@ -116,7 +116,8 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
     distance: Annotated[
         float | None, arg(metavar="RADII", help_behavior_hint=f"(default: {DISTANCES[0]:g})")
     ] = None
-    """Of the circle from the middle of the scene; by default another one where it would lead through something."""
+    """Of the circle from the middle of the scene; by default another one where it would lead through something, or
+    where a file without cameras holds an object that would not be whole in the pictures."""
 
     label: Annotated[str | None, arg(metavar="TEXT", help_behavior_hint=NO_DEFAULT)] = None
     """Words in the lower left corner of each picture; {bytes} stands for the size of the file."""
@@ -276,15 +277,18 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
         return [(name, camera) for (name, _), camera in zip(frames, clear, strict=True)]
 
     def circle(self, model: "Renderable") -> "Sequence[tuple[str, Camera]]":
+        from compgs.evaluation.camera_path import distance_of_all
         from compgs.evaluation.clearance import clear_orbit
 
-        return clear_orbit(
-            model,
-            **self.pictures(model.viewpoints),
-            up=self.up or UP,
-            elevations=ELEVATIONS if self.elevation is None else (self.elevation,),
-            distances=DISTANCES if self.distance is None else (self.distance,),
-        )
+        pictures, up = self.pictures(model.viewpoints), self.up or UP
+        elevations = ELEVATIONS if self.elevation is None else (self.elevation,)
+        distances = DISTANCES if self.distance is None else (self.distance,)
+        if self.distance is None and not model.viewpoints:
+            # Far away from the cameras of a capture nothing is known; an object without a capture is shown whole.
+            size = {"width": pictures["width"], "height": pictures["height"]}
+            far = distance_of_all(model.bounds[0], **size, up=up, elevation=elevations[0])
+            distances = (far, *(each for each in DISTANCES if each != far))
+        return clear_orbit(model, **pictures, up=up, elevations=elevations, distances=distances)
 
     def render(self, model: "Renderable", views: "Sequence[tuple[str, Camera]]") -> None:
         times: list[float] = []

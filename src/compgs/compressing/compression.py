@@ -184,7 +184,7 @@ class Compression:
         compared = compare(self.splats, self.scene.test_views, device=self.device)
         compressed = Compressed(
             source=self.begun.source,
-            source_bytes=sum(component_bytes(self.begun.source).values()),
+            source_bytes=sum(component_bytes(self.begun.source, self.begun.looking.level).values()),
             splats=len(self.splats.splats),
             file=self.file,
             folder=folder,
@@ -226,7 +226,7 @@ def begin(
         steps = steps_within(scene, config, end - time.monotonic(), device)
         config = replace(config, training=replace(config.training, steps=steps))
         deadline = Deadline(end, steps)
-    begun = Begun(source, digest(source), looking, placed, config)
+    begun = Begun(source, digest(splats), looking, placed, config)
     run.save(folder_of(output), begun)
     device = chosen_device(device)
     plan = plan_for(scene, config, training_device(device))
@@ -258,7 +258,7 @@ def resumed(output: Path, source: Path | None = None, *, device: str | None = No
     if source is not None:
         begun = replace(begun, source=source)
     splats = opened(begun.source, begun.looking, device)
-    if digest(begun.source) != begun.sha256:
+    if digest(splats) != begun.sha256:
         raise CheckpointError(
             f"{begun.source}: not the splats that {output} was begun with; compress them anew"
         )
@@ -283,7 +283,7 @@ def opened(source: Path, looking: Looking, device: str | None) -> SplatModel:
         raise NotACompGSFile(
             f"{source}: a .cgs file is compressed already; `compgs encode` makes one smaller without training"
         )
-    model = open_scene(source, chosen_device(device), looking.background)
+    model = open_scene(source, chosen_device(device), looking.background, looking.level)
     if not isinstance(model, SplatModel):
         raise SplatFileError(
             f"{source}: its splats are made anew for each camera by networks; expected splats that stay as they are"
@@ -291,9 +291,12 @@ def opened(source: Path, looking: Looking, device: str | None) -> SplatModel:
     return model
 
 
-def digest(source: Path) -> str:
-    """Return a digest by which a file is known again."""
-    return hashlib.sha256(source.read_bytes()).hexdigest()
+def digest(splats: SplatModel) -> str:
+    """Return a digest by which the splats of a file, or of several files, are known again."""
+    result = hashlib.sha256()
+    for column in splats.splats.columns.values():
+        result.update(np.ascontiguousarray(column).tobytes())
+    return result.hexdigest()
 
 
 def placed_cameras(

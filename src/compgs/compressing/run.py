@@ -32,6 +32,7 @@ class Looking:
     up: tuple[float, float, float] = UP  # direction of the sky
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB, 0 to 1; files of splats have none
     cameras: str | None = None  # file or folder of cameras to look through; None: they are placed
+    level: int | None = None  # of a streamed .sog (lod-meta.json); None: 0, the finest
 
     def check(self) -> None:
         """Raises ConfigError for what nothing could be looked at with."""

@@ -177,15 +177,23 @@ def open_scene(
     found = format_of(path)
     if level is None:
         return found.open(path, device, background)
-    if found is not STREAMED:
-        raise ConfigError(f"{path}: --level is for scenes of several levels ({sog_streamed.NAME})")
+    _check_has_levels(path)
     return placed(SplatModel(sog_streamed.read(path, level), background), device)
 
 
-def component_bytes(path: str | Path) -> dict[str, int]:
+def component_bytes(path: str | Path, level: int | None = None) -> dict[str, int]:
     """Bytes of each component of a file; they sum to its size. Raises as `open_scene` does."""
     path = scene_file(Path(path))
-    return format_of(path).component_bytes(path)
+    if level is None:
+        return format_of(path).component_bytes(path)
+    _check_has_levels(path)
+    return sog_streamed.component_bytes(path, level)
+
+
+def _check_has_levels(path: Path) -> None:
+    """Raises ConfigError."""
+    if format_of(path) is not STREAMED:
+        raise ConfigError(f"{path}: --level is for scenes of several levels ({sog_streamed.NAME})")
 
 
 def writer_of(path: Path) -> str:

@@ -80,22 +80,37 @@ def read(path: Path, level: int = FINEST) -> SplatArrays:
     if scene.unused:
         note(path, f"not used: {', '.join(scene.unused)}")
     found: list[SplatArrays] = []
+    says_antialiased: dict[str, bool] = {}
     for name, ranges in scene.rows[level].items():
         part = sog.splats(_part(scene, name))
         last = max(rows.end for rows in ranges)
         if last > len(part):
             raise SplatFileError(f"{path}: names {last} splats of {name}, which holds {len(part)}; {_COPY}")
         found += [part.rows(np.arange(rows.start, rows.end)) for rows in ranges]
+        says_antialiased[name] = part.antialiased
     if scene.environment:
         found.append(sog.splats(_part(scene, scene.environment)))
+        says_antialiased[scene.environment] = found[-1].antialiased
+    _tell_of_disagreement(path, says_antialiased)
     return drawable(path, joined(found))
 
 
-def component_bytes(path: Path) -> dict[str, int]:
-    """Bytes of each component of the finest level; they sum to the size of this file and of the parts that it needs."""
+def _tell_of_disagreement(path: Path, says_antialiased: dict[str, bool]) -> None:
+    """A scene is drawn in one way: as its first part says."""
+    (first, drawn), *_ = says_antialiased.items()
+    others = [name for name, says in says_antialiased.items() if says != drawn]
+    if others:
+        one, other = ("antialiased", "not antialiased") if drawn else ("not antialiased", "antialiased")
+        named = others[0] if len(others) == 1 else f"{others[0]} and {len(others) - 1} more parts"
+        note(path, f"{first} is {one}, {named} {other}: all of them are drawn {one}, as the first part says")
+
+
+def component_bytes(path: Path, level: int = FINEST) -> dict[str, int]:
+    """Bytes of each component of a level; they sum to the size of this file and of the parts that it needs."""
     scene = read_meta(path)
+    check_level(scene, level)
     sizes = {"container": path.stat().st_size}
-    for name in _parts(scene, FINEST):
+    for name in _parts(scene, level):
         for component, size in sog.component_bytes(_part(scene, name)).items():
             sizes[component] = sizes.get(component, 0) + size
     return sizes

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from compgs.cameras import Camera
-from compgs.evaluation.camera_path import orbit
+from compgs.evaluation.camera_path import whole
 from compgs.formats import component_bytes, format_of, open_scene, scene_file, scene_name
 from compgs.render import Renderable
 from compgs.words import size
@@ -144,7 +144,7 @@ def _prefixes(path: Path) -> list[tuple[int, str]]:
 
 def _beside(model: Renderable) -> Camera:
     """Return a camera of the world, for a file that keeps none."""
-    ((_, camera),) = orbit(model.bounds[0], frames=1, width=640, height=480)
+    ((_, camera),) = whole(model.bounds[0], frames=1, width=640, height=480)
     return camera.moved(-np.array(model.world_offset))
 
 

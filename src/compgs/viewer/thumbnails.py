@@ -73,7 +73,7 @@ def _found_wrong(file: Path) -> str | None:
 
 def _drawn(file: Path) -> bytes:
     """Raises BitstreamError."""
-    from compgs.evaluation.camera_path import orbit
+    from compgs.evaluation.camera_path import whole
     from compgs.formats import open_scene
     from compgs.metrics import to_8bit
     from compgs.render import render
@@ -84,7 +84,7 @@ def _drawn(file: Path) -> bytes:
         scale = max(WIDTH / camera.width, HEIGHT / camera.height)
         camera = camera.resized(*(max(1, round(side * scale)) for side in (camera.width, camera.height)))
     else:
-        camera = orbit(model.bounds[0], frames=1, width=WIDTH, height=HEIGHT)[0][1]
+        camera = whole(model.bounds[0], frames=1, width=WIDTH, height=HEIGHT)[0][1]
         camera = camera.moved([-x for x in model.world_offset])
     picture = Image.fromarray(to_8bit(render(model, camera).image))
     left, top = (picture.width - WIDTH) // 2, (picture.height - HEIGHT) // 2
