@@ -3,7 +3,8 @@
     compgs demo-scene demo/scene
     python tools/task_pictures.py docs/gallery/demo.cgs demo/scene
 
-They show the demo's scene, which the program makes itself, and its file.
+They show the demo's scene, which the program makes itself, and its file. task_look and task_share are screenshots of the
+program's own pages: `compgs export demo.cgs demo.html`, and `compgs serve docs/gallery`.
 """
 
 import argparse
@@ -85,9 +86,7 @@ def comparison(file: Path, scene: Scene) -> None:
         captions = [f"demo.cgs, {size(file.stat().st_size)}", f"demo.spz, {size(other.stat().st_size)}"]
     difference = np.clip(8 * np.abs(ours.astype(int) - theirs), 0, 255).astype(np.uint8)
     captions.append(f"difference times 8; {psnr(ours, theirs):.1f} dB")
-    row = beside([Image.fromarray(image) for image in (ours, theirs, difference)], captions)
-    save(row, "compare")
-    save(row, "export")
+    save(beside([Image.fromarray(image) for image in (ours, theirs, difference)], captions), "compare")
     photograph = scene.test_views[0].image
     captions = [
         "scene.test_views[0].image",
