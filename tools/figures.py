@@ -109,6 +109,24 @@ def printed(name: str) -> str:
     return "\n".join(lines)
 
 
+SHOWN = {
+    "brighton": "a park by a lake, from 18 photographs of a drone; they leave the trees blurred",
+    "demo": "balls, boxes and a floor, made by `compgs demo-scene` and trained by `make demo`",
+}
+
+
+def gallery() -> str:
+    """A row for each file of the gallery."""
+    lines = ["| scene | open | file | bytes | what it shows |", "|---|---|---|---:|---|"]
+    for file in sorted((ROOT / "docs" / "gallery").glob("*.cgs")):
+        page = f'<a href="gallery/{file.stem}.html">page</a>'
+        bytes_ = number(file.stat().st_size)
+        lines.append(
+            f"| {file.stem} | {page} | [{file.name}](gallery/{file.name}) | {bytes_} | {SHOWN[file.stem]} |"
+        )
+    return "\n".join(lines)
+
+
 def measured(*names: str) -> str:
     """A row for each record of these names, or for each, with all that was measured."""
     head = [
@@ -373,7 +391,7 @@ def similar(name: str) -> str:
 FUNCTIONS: dict[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
-        captures, printed, measured, paper, components, methods, compared, ablation, ablation_components,
+        captures, printed, gallery, measured, paper, components, methods, compared, ablation, ablation_components,
         complexity_time, complexity_memory, curves, prefix, similar,
     )
 }  # fmt: skip

@@ -3,8 +3,8 @@
     compgs demo-scene demo/scene
     python tools/task_pictures.py docs/gallery/demo.cgs demo/scene
 
-They show the demo's scene, which the program makes itself, and its file. task_look and task_share are screenshots of the
-program's own pages: `compgs export demo.cgs demo.html`, and `compgs serve docs/gallery`.
+They show the demo's scene, which the program makes itself, and its file. task_look and task_share are screenshots of
+the program's own pages: `compgs export demo.cgs demo.html`, and `compgs serve docs/gallery`.
 """
 
 import argparse
