@@ -59,6 +59,7 @@ from compgs.methods.cosa import COSA
 from compgs.methods.eagles import EAGLES
 from compgs.methods.lightgaussian import LIGHTGAUSSIAN
 from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
+from compgs.methods.pruned import PRUNED_SOG, PRUNED_SPZ
 from compgs.methods.running import settings_of, train, write
 from compgs.methods.scaffold_gs import SCAFFOLD_GS
 
@@ -69,6 +70,8 @@ METHODS: dict[str, Method] = {
         splats.PLAIN,
         splats.SPZ,
         splats.SOG,
+        PRUNED_SPZ,
+        PRUNED_SOG,
         COMPACT3D,
         C3DGS,
         LIGHTGAUSSIAN,

@@ -28,14 +28,20 @@ def _train_near(
     scene: "Scene", config: "Config", run: "Run", start: "SplatModel | None" = None
 ) -> "SplatModel":
     """The same for a format that does not say where its positions count from."""
+    check_near(scene, run.method)
+    return train_plain(scene, config, run, start)
+
+
+def check_near(scene: "Scene", method: str) -> None:
+    """Raises ConfigError where a scene lies too far away for the file of `spz`, `sog` and their pruned kin."""
     from compgs.scene.world import world_offset
 
     if any(world_offset(scene)):
+        suffix = method.rpartition("-")[2]
         raise ConfigError(
-            f"{scene.name}: lies far from the origin of its coordinates, and a .{run.method} file cannot say where its "
+            f"{scene.name}: lies far from the origin of its coordinates, and a .{suffix} file cannot say where its "
             "positions count from; use method 3dgs, or move the capture"
         )
-    return train_plain(scene, config, run, start)
 
 
 def _writes(suffix: str) -> "Callable[[SplatModel, Path, Config], int]":
