@@ -73,6 +73,7 @@ async function embedded(name, entry) {
 
 const embedWorker = await embedded("compgs:worker", "viewer/worker.ts");
 const embedLiveWorker = await embedded("compgs:live-worker", "src/live/worker.ts");
+const embedSorter = await embedded("compgs:sorter", "engines/three_sorter.ts");
 
 // Modules of one package: what several of them have is in a file that they share. Those of earlier builds have other names.
 await rm(`${folder}/parts`, { recursive: true, force: true });
@@ -83,18 +84,19 @@ await build({
     viewer: "viewer/viewer.ts",
     live: "src/live/index.ts",
     spark: "engines/spark.ts",
+    three: "engines/three.ts",
     playcanvas: "engines/playcanvas.ts",
   },
   outdir: folder,
   splitting: true,
   chunkNames: "parts/[hash]",
-  plugins: [embedKernels, embedWorker, embedLiveWorker],
+  plugins: [embedKernels, embedWorker, embedLiveWorker, embedSorter],
   external: ["three", "@sparkjsdev/spark", "playcanvas"],
 });
 await build({
   ...shared,
-  entryPoints: ["src/live/worker.ts"],
-  outfile: `${folder}/worker.js`,
+  entryPoints: { worker: "src/live/worker.ts", sorter: "engines/three_sorter.ts" },
+  outdir: folder,
   format: "iife",
 });
 

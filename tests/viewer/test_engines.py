@@ -1,4 +1,4 @@
-"""The package of web/, installed from its tarball into an empty project: .cgs files in Spark and in PlayCanvas."""
+"""The package of web/, installed from its tarball into an empty project: .cgs files in Spark, PlayCanvas, three.js."""
 
 import http.server
 import json
@@ -34,7 +34,7 @@ from made_heads import VIEW_DIM, make_heads
 
 LEAST_DB = 35.0
 WIDTH, HEIGHT = 240, 160
-ENGINES = ("spark", "playcanvas")
+ENGINES = ("spark", "playcanvas", "three")
 SCENES = ("far away", "hardly dilated")
 # Splats are drawn by software on a machine that does other things, too.
 MAX_SECONDS = 180
@@ -307,7 +307,7 @@ window.result = JSON.stringify({ names, counts, bytes: data.byteLength, damaged,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", REGISTERED)
 def test_engines_know_the_files_by_ending_and_media_type_and_name_what_is_wrong(
     engine: str, node: str, browser: str, project: Path, tmp_path: Path
 ) -> None:
@@ -335,7 +335,10 @@ def test_a_bundler_takes_only_what_is_used(node: str, project: Path) -> None:
         outside = ("--external:three", "--external:playcanvas", "--external:@sparkjsdev/spark")
         return len(bundled(node, project, entry, "--minify", *outside))
 
-    assert size('import "compgs"; import "compgs/spark"; import "compgs/playcanvas";') < 200
+    assert (
+        size('import "compgs"; import "compgs/spark"; import "compgs/playcanvas"; import "compgs/three";')
+        < 200
+    )
     alone = size('import { decode } from "compgs"; console.log(decode);')
     assert alone < 90_000
     for engine in ENGINES:  # the decoder is there once, as the worker
@@ -348,8 +351,9 @@ def test_types_hold_in_a_project_of_their_own(node: str, project: Path) -> None:
 import { LiveScene } from "compgs/live";
 import { CgsMesh, CgsSparkRenderer, registerCgs } from "compgs/spark";
 import { type CgsResource, goTo, loadSplats } from "compgs/playcanvas";
+import { CgsSplats } from "compgs/three";
 import { Viewer } from "compgs/viewer";
-import { DefaultLoadingManager, type PerspectiveCamera, type WebGLRenderer } from "three";
+import { DefaultLoadingManager, type Mesh, type PerspectiveCamera, type WebGLRenderer } from "three";
 import type { AppBase, Entity } from "playcanvas";
 import type { SplatMesh } from "@sparkjsdev/spark";
 
@@ -359,6 +363,7 @@ export async function use(app: AppBase, camera: Entity, renderer: WebGLRenderer)
   const seen: Gaussians = (await later).splatsFor({ worldToCamera: poseOf([1, 0, 0, 0], [0, 0, 0]) });
   const mesh: SplatMesh = new CgsMesh("scene.cgs");
   const start: PerspectiveCamera = new CgsMesh(new Blob()).camera(1, 1.5);
+  const quads: Mesh = await new CgsSplats("scene.cgs", { sorter: new Worker("sorter.js") }).complete;
   const splats: Entity = await loadSplats(app, "scene.cgs", { onSplats: (found: CgsResource) => found.info });
   goTo(camera, splats, 1);
   registerCgs(DefaultLoadingManager);
@@ -371,7 +376,7 @@ export async function use(app: AppBase, camera: Entity, renderer: WebGLRenderer)
   // @ts-expect-error: of this layout there is no such thing
   new LiveScene("scene.cgs", { layout: "spark", onSplats: ({ geometry }) => geometry.means, onColors() {} });
   new Viewer(document.body).open("scene.cgs");
-  console.log(now, seen, mesh, start, new CgsSparkRenderer({ renderer }));
+  console.log(now, seen, mesh, start, quads, new CgsSparkRenderer({ renderer }));
 }
 """
     )

@@ -12,25 +12,21 @@ import {
   Color,
   Loader,
   type LoadingManager,
-  Matrix4,
-  PerspectiveCamera,
+  type PerspectiveCamera,
   SRGBColorSpace,
   type Scene,
   Vector2,
-  Vector3,
+  type Vector3,
   type WebGLRenderer,
 } from "three";
 import { LiveScene, type Splats } from "../src/live/live_scene.ts";
 import type { SceneInfo } from "../src/scene_info.ts";
 import { type Source, isCgs } from "../src/sources.ts";
-import { CUTOFF, NEAR, dilationOf } from "../viewer/splatting.ts";
-import { startCamera } from "./viewpoint.ts";
+import { CUTOFF, dilationOf } from "../viewer/splatting.ts";
+import { viewpointCamera, viewpointTarget } from "./three_view.ts";
 
 export { splatBudget } from "../src/budget.ts";
 export { isCgs, MEDIA_TYPE } from "../src/sources.ts";
-
-/** Times the extent of the scene, from the camera: beyond it nothing is drawn. */
-const FAR = 1_000;
 
 export interface CgsMeshOptions {
   /** Bytes of the file so far and of all, the latter if it is known. */
@@ -86,28 +82,12 @@ export class CgsMesh extends SplatMesh {
 
   /** A camera at one of the file's viewpoints, that sees all of its picture; its `up` is the scene's, for controls. */
   camera(view = 0, aspect = 1): PerspectiveCamera {
-    const info = this.known();
-    const { right, up, back, centre, sceneUp, fieldOfView } = startCamera(info, view, aspect);
-    const far = FAR * info.extent + Math.hypot(...centre);
-    const camera = new PerspectiveCamera((fieldOfView * 180) / Math.PI, aspect, NEAR, far);
-    this.updateWorldMatrix(true, false);
-    new Matrix4()
-      .makeBasis(new Vector3(...right), new Vector3(...up), new Vector3(...back))
-      .setPosition(...centre)
-      .premultiply(this.matrixWorld)
-      .decompose(camera.position, camera.quaternion, new Vector3());
-    camera.up.set(...sceneUp).transformDirection(this.matrixWorld);
-    return camera;
+    return viewpointCamera(this, this.known(), view, aspect);
   }
 
   /** What controls turn about, from one of the file's viewpoints. */
   target(view = 0): Vector3 {
-    const { back, centre, distance } = startCamera(this.known(), view, 1);
-    this.updateWorldMatrix(true, false);
-    return new Vector3(...back)
-      .multiplyScalar(-distance)
-      .add(new Vector3(...centre))
-      .applyMatrix4(this.matrixWorld);
+    return viewpointTarget(this, this.known(), view);
   }
 
   private known(): SceneInfo {

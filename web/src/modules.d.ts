@@ -18,3 +18,8 @@ declare module "compgs:live-worker" {
   const source: string;
   export default source;
 }
+/** The program that sorts splats in plain three.js, bundled by the build. */
+declare module "compgs:sorter" {
+  const source: string;
+  export default source;
+}
