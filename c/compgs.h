@@ -13,6 +13,10 @@
  * C99 or C++; needs the standard library and -lm. It reads versions 2 to 5, whole files and their beginnings, and refuses
  * what the document refuses; positions by G-PCC it does not read. Nothing is kept: several threads may decode at once.
  * Allocations are bounded by the limits of the document. License: Apache-2.0, as the rest of CompGS.
+ *
+ * Its 1 911 lines of code are half of those of the decoder for the web: container and limits 500, tables, streams and
+ * arrays 250, networks and heads 250, the arithmetic code and the octree 540, latents and masks 280, optional sections
+ * 100, Gaussians 120. Leaving out versions 2 to 4, or beginnings of files, would save less than 100 of them each.
  */
 #ifndef COMPGS_H
 #define COMPGS_H
