@@ -1,8 +1,9 @@
 """From a file of splats to a small file, and what is said of it."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -157,9 +158,36 @@ def test_given_cameras_are_split_as_scenes_are_and_more_come_between(ball, tmp_p
 
 def test_steps_are_as_many_as_fit_into_the_time(monkeypatch: pytest.MonkeyPatch, config: Config) -> None:
     monkeypatch.setattr(pace, "seconds_per_step", lambda *_: 0.05)
-    steps = pace.steps_within(None, config, 100.0, None)
-    assert abs(steps - 2000 / pace.WHOLE_RUN) < 20
-    assert pace.steps_within(None, config, 0.1, None) == pace.FEWEST
+    fitting = pace.steps_within(None, config, 100.0, None)
+    assert abs(fitting.steps - 2000 / pace.WHOLE_RUN) < 20 and fitting.late == 0
+    short = pace.steps_within(None, config, 2.0, None)
+    assert short.steps == pace.FEWEST
+    assert short.late == pytest.approx(0.05 * pace.WHOLE_RUN * pace.FEWEST - 2.0, abs=0.2)
+
+
+@dataclass(frozen=True)
+class Views:
+    """As much of a scene as a trial asks for."""
+
+    train_views: tuple[int, ...]
+
+
+@pytest.mark.parametrize(("seconds", "steps"), [(1e6, pace.TRIED), (200.0, 21), (5.0, pace.LEAST_TRIED)])
+def test_a_trial_takes_a_part_of_the_time_only(
+    monkeypatch: pytest.MonkeyPatch, config: Config, seconds: float, steps: int
+) -> None:
+    clock = [0.0]
+
+    def train(scene, config, *, progress, **_):  # a step a second
+        for step in range(1, config.training.steps + 1):
+            clock[0] += 1.0
+            progress(SimpleNamespace(step=step, seconds_per_step=1.0))
+
+    monkeypatch.setattr(pace.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(pace, "train", train)
+    monkeypatch.setattr(pace, "plan_for", lambda *_: None)
+    assert pace.seconds_per_step(Views((0,)), config, "cpu", seconds) == 1.0
+    assert clock[0] == steps
 
 
 def test_a_time_is_kept_and_its_steps_are_written_down(

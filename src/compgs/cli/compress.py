@@ -214,7 +214,7 @@ class Compress(ComputingCommand, LevelOption):
 
 def say_what(compression: "Compression") -> None:
     """What is about to happen."""
-    from compgs.compressing.deadline import ENOUGH
+    from compgs.compressing.deadline import ENOUGH, FEWEST
 
     scene, begun = compression.scene, compression.begun
     camera = scene.train_views[0].camera
@@ -227,6 +227,11 @@ def say_what(compression: "Compression") -> None:
         say(line)
     if begun.config.training.steps < ENOUGH and compression.deadline is not None:
         warn(f"so little time gives a rough file: {ENOUGH:,} steps or more are wanted")
+        if compression.deadline.late >= 1.0:
+            warn(
+                f"the time is too short for {FEWEST} steps, the fewest that show anything: at the present speed of "
+                f"this machine the file comes about {duration(compression.deadline.late)} later"
+            )
     if compression.goes_on:
         say("goes on from the last checkpoint")
 

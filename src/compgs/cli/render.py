@@ -282,7 +282,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
 
         pictures, up = self.pictures(model.viewpoints), self.up or UP
         elevations = ELEVATIONS if self.elevation is None else (self.elevation,)
-        distances = DISTANCES if self.distance is None else (self.distance,)
+        distances: tuple[float, ...] = DISTANCES if self.distance is None else (self.distance,)
         if self.distance is None and not model.viewpoints:
             # Far away from the cameras of a capture nothing is known; an object without a capture is shown whole.
             size = {"width": pictures["width"], "height": pictures["height"]}

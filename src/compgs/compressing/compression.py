@@ -223,9 +223,9 @@ def begin(
     deadline = None
     if seconds is not None:
         end = start + seconds * (1 - FOR_THE_REST)
-        steps = steps_within(scene, config, end - time.monotonic(), device)
-        config = replace(config, training=replace(config.training, steps=steps))
-        deadline = Deadline(end, steps)
+        fitting = steps_within(scene, config, end - time.monotonic(), device)
+        config = replace(config, training=replace(config.training, steps=fitting.steps))
+        deadline = Deadline(end, fitting.steps, late=fitting.late)
     begun = Begun(source, digest(splats), looking, placed, config)
     run.save(folder_of(output), begun)
     device = chosen_device(device)

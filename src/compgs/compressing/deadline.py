@@ -28,10 +28,13 @@ class PassesOver(Protocol):
 class Deadline:
     """Keeps a run to its time: called between any two steps, and told how the run gets on."""
 
-    def __init__(self, end: float, steps: int) -> None:
-        """`end`: of the training, on the clock of `time.monotonic`; `steps` of the run."""
+    def __init__(self, end: float, steps: int, *, late: float = 0.0) -> None:
+        """`end`: of the training, on the clock of `time.monotonic`; `steps` of the run; `late`: seconds after the end
+        in which even the fewest steps are taken, as known before the first one.
+        """
         self.end = end
         self.steps = steps
+        self.late = late
         self.taken = 0  # steps that were learned in
         self._behind = 0.0  # steps to pass over for each that is taken
         self._owed = 0.0

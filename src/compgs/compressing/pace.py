@@ -1,7 +1,8 @@
 """How many steps fit into a time: a few are tried, on the scene as it is, and thrown away."""
 
+import contextlib
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 from compgs.compressing.deadline import FEWEST
@@ -11,31 +12,57 @@ from compgs.scene.views import Scene
 from compgs.training import TrainingStatus, plan_for
 from compgs.training.run.loop import chosen_device
 
-TRIED = 40  # steps
+TRIED = 40  # steps; fewer where these alone would take much of the time
+LEAST_TRIED = 10  # steps
+TRIED_PART = 0.1  # of the time
 TRIED_VIEWS = 12
 # A step of the whole run, in steps of its beginning: anchors grow, then most of them are pruned, and the rate is always
 # counted in (measured: docs/results/compress.md).
 WHOLE_RUN = 1.0
 
 
-def steps_within(scene: Scene, config: Config, seconds: float, device: str | None) -> int:
-    """Steps of a training that ends about `seconds` from now; FEWEST at least."""
+@dataclass(frozen=True)
+class Fitting:
+    """The steps that fit into a time, FEWEST at least."""
+
+    steps: int
+    late: float = 0.0  # seconds after the time, in which the fewest steps end where they do not fit
+
+
+def steps_within(scene: Scene, config: Config, seconds: float, device: str | None) -> Fitting:
+    """Steps of a training that ends about `seconds` from now."""
     start = time.perf_counter()
-    pace = seconds_per_step(scene, config, device)
+    pace = WHOLE_RUN * seconds_per_step(scene, config, device, seconds)
     left = seconds - (time.perf_counter() - start)
-    return max(FEWEST, int(left / (WHOLE_RUN * pace)))
+    steps = max(FEWEST, int(left / pace))
+    return Fitting(steps, max(0.0, steps * pace - left))
 
 
-def seconds_per_step(scene: Scene, config: Config, device: str | None) -> float:
+class _Enough(Exception):
+    """The trial has taken its part of the time."""
+
+
+def seconds_per_step(
+    scene: Scene, config: Config, device: str | None, seconds: float = float("inf")
+) -> float:
     """Seconds of a step with everything in it, as long as the steps of a run are on average: the first ones look at
     coarse photographs, as in a whole run. The very first, which loads and compiles kernels, does not count.
 
-    The plan is the whole scene's: the few views that are tried would make another one.
+    The plan is the whole scene's: the few views that are tried would make another one. Of `seconds` the trial takes no
+    more than a part.
     """
+    end = time.monotonic() + TRIED_PART * seconds
     plan = plan_for(scene, config, chosen_device(device))
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
     told: list[TrainingStatus] = []
-    train(replace(scene, train_views=views), trial(config), device=device, progress=told.append, plan=plan)
+
+    def tell(status: TrainingStatus) -> None:
+        told.append(status)
+        if status.step >= LEAST_TRIED and time.monotonic() > end:
+            raise _Enough
+
+    with contextlib.suppress(_Enough):
+        train(replace(scene, train_views=views), trial(config), device=device, progress=tell, plan=plan)
     return fmean(status.seconds_per_step for status in told)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -28,6 +29,7 @@ def write_animation(
     pictures = [Image.fromarray(frame) if webp else _few_colors(frame) for frame in frames]
     if not pictures:
         raise OutputError(f"{path}: there are no frames to write")
+    options: dict[str, Any]
     if webp:
         options = {
             "format": "WEBP",
