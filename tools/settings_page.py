@@ -27,7 +27,7 @@ Every setting of a training. Most runs need none of them: `--lmbda`, `--steps`, 
 options of their own. `--set SECTION.NAME=VALUE` sets any other one, as often as needed. `compgs train --plan` prints
 the values that a run would use.
 
-- A column shows the value of a preset if it differs from `default`.
+- The value is that of the preset `default`. Another preset is named if its value differs.
 - Schedules are shares of the run: 0.3 is 30 % of the steps.
 - "Ref." marks values of the configuration that the paper's authors released.
 
@@ -73,17 +73,19 @@ def summary(kind: type) -> str:
 
 
 def table(kind: type, comments: dict[str, str], section: str, presets: dict[str, Any]) -> str:
-    others = [name for name in presets if name != "default"]
-    lines = [
-        "| " + " | ".join(["setting", "default", *others, "may be", "meaning"]) + " |",
-        "|" + "---|" * (4 + len(others)),
-    ]
+    """Markdown of one section: a row for each setting."""
+    lines = ["| setting | value | may be | meaning |", "|---|---|---|---|"]
     hints = typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]
         values = {name: getattr(getattr(preset, section), field.name) for name, preset in presets.items()}
-        shown = [shown_value(values["default"])]
-        shown += [shown_value(values[name]) if values[name] != values["default"] else "" for name in others]
-        cells = [f"`{field.name}`", *shown, allowed(hints[field.name]), comments.get(field.name, "")]
+        default = values.pop("default")
+        others = [f"`{name}`: {shown_value(value)}" for name, value in values.items() if value != default]
+        cells = [
+            f"`{field.name}`",
+            "; ".join([shown_value(default), *others]),
+            allowed(hints[field.name]),
+            comments.get(field.name, ""),
+        ]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(lines) + "\n"
 

@@ -18,4 +18,4 @@ def test_the_page_is_what_the_tool_makes_of_the_settings() -> None:
     for section, values in Config().to_dict().items():
         for name in values:
             assert f"| `{name}` |" in page, f"{section}.{name}"
-    assert f"| {load_config('paper').model.coupled_primitives} |" in page
+    assert f"; `paper`: {load_config('paper').model.coupled_primitives} |" in page
