@@ -58,37 +58,37 @@ Shares = Annotated[tuple[float, ...], Range(0, 1)]
 class ModelConfig:
     """Hybrid primitives and their prediction (Sec. 3.1, 3.2)."""
 
-    # K, per anchor (10 in Sec. 3.4: slower, and no better at the same size)
+    # K, the coupled primitives of an anchor (Sec. 3.4: 10, which is slower and no better at the same size)
     coupled_primitives: Annotated[int, Range(1, 64)] = 5
     # channels of a reference embedding (Sec. 3.4)
     reference_dim: Annotated[int, Range(1, 256)] = 32
     # channels of a residual embedding (Sec. 3.4)
     residual_dim: Annotated[int, Range(1, 64)] = 8
-    # True: each anchor has its own K residual embeddings (Sec. 3.1); else all share K of them
+    # true: each anchor has its own K residual embeddings (Sec. 3.1); false: all anchors share K of them
     residuals: bool = False
-    # pixels^2 of the training photographs that are added to the variances of what is projected (3DGS); the file keeps
-    # them as an angle, for pictures of other sizes
+    # pixels^2 added to the variances of projected splats (3DGS: 0.3), in pictures of the size of the training
+    # photographs; the file keeps an angle, for pictures of other sizes
     dilation: Annotated[float, Range(0.01, 10)] = 0.3
     # hidden width of the residual MLPs (Ref.)
     width: Annotated[int, Range(8, 256, multiple=8)] = 32
-    # what reference embeddings are coded around: what anchors around them have that come before in the file (not in
-    # the paper; training pays by a hyperprior, which the file does not hold), a hyperprior (Sec. 3.3), or one mean a
+    # predicts the reference embeddings in the file. neighbours: earlier anchors around an anchor (not in the paper;
+    # training estimates the rate with a hyperprior that the file does not hold); hyperprior: Sec. 3.3; none: one mean a
     # channel
     reference_context: Literal["neighbours", "hyperprior", "none"] = "neighbours"
-    # whether symbols of an anchor, or of a coupled primitive, say something about its later ones in the file (not in
-    # the paper; training pays for each by itself)
+    # earlier symbols of an anchor, or of a coupled primitive, predict its later ones in the file (not in the paper;
+    # training pays for each symbol by itself)
     row_context: bool = True
     # separate: four networks (Sec. 3.2); paired: geometry, appearance
     heads: Literal["separate", "paired"] = "paired"
-    # world units between neighbouring anchors; None: from the points' spacing
+    # world units between neighbouring anchors; none: `voxel_spacings` decides
     voxel_size: Annotated[float | None, Range(0, above=True)] = None
-    # median distances of the points to a voxel, where voxel_size is not given
+    # size of a voxel, in median distances between neighbouring points, if `voxel_size` is none
     voxel_spacings: Annotated[float, Range(0, 1e6, above=True, below=True)] = 1.5
-    # and voxels grow with this power of lambda / 0.002 above it (not in the paper; rule `coarser_grid`)
+    # voxels grow with this power of lambda / 0.002, if lambda is above 0.002 (not in the paper; rule `coarser_grid`)
     voxel_rate_exponent: Annotated[float, Range(0, 1)] = 1 / 6
     # anchors start with the colors of the points, in three channels of their references
     point_colors: bool = True
-    # growth stops here
+    # growth stops at this number of anchors
     max_anchors: Annotated[int, Range(1, 1 << 24)] = 1_000_000
 
 
@@ -96,26 +96,26 @@ class ModelConfig:
 class EntropyConfig:
     """Quantization and rate (Sec. 3.3)."""
 
-    # hyperprior channels of a reference embedding, where it has one (Ref.)
+    # hyperprior channels of a reference embedding, if it has a hyperprior (Ref.)
     reference_hyper_dim: Annotated[int, Range(1, 64)] = 4
     # quantization step of reference embeddings (1 in Sec. 3.4 costs 0.5 dB in short runs)
     reference_step: Annotated[float, Range(0, 1e3, above=True, below=True)] = 0.33
     # quantization step of residual embeddings (1 in Sec. 3.4)
     residual_step: Annotated[float, Range(0, 1e3, above=True, below=True)] = 0.5
-    # initial learned steps of the anchors' log scales (0.01 in Sec. 3.4: bits for what nobody sees)
+    # initial learned steps of the anchors' log scales (Sec. 3.4: 0.01, which spends bits that nobody sees)
     covariance_step: Annotated[float, Range(0, 10, above=True, below=True)] = 0.15
-    # of the steps: references are turned into their principal axes, at the last of them channels that hardly say
-    # anything are dropped (not in the paper)
+    # shares of the run at which references are rotated into their principal axes; the last time, channels that carry
+    # almost nothing are dropped (not in the paper)
     decorrelate_at: Shares = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
-    # False: latents are trained unrounded, as a bound that no file reaches (ablation)
+    # false: latents are trained unrounded, as a bound that no file reaches (ablation)
     quantized: bool = True
     # residual blocks of the entropy networks (two in Sec. 3.4); 0: one linear layer
     network_blocks: Annotated[int, Range(0, 3)] = 0
-    # of their hidden layers (Ref.)
+    # width of the hidden layers of the entropy networks (Ref.)
     network_width: Annotated[int, Range(1, 1024)] = 32
-    # of the entropy networks' weights in the file; the run trains with them so rounded
+    # bits of a weight of the entropy networks in the file; the run trains with weights so rounded
     network_bits: Annotated[int, Range(6, 16)] = 10
-    # of the prediction heads' weights in the file
+    # bits of a weight of the prediction heads in the file
     head_bits: Annotated[int, Range(6, 16)] = 7
 
 
@@ -123,47 +123,49 @@ class EntropyConfig:
 class ControlConfig:
     """Adaptive control of the anchors: growth and pruning (Ref.). `training/structure/control.py` has its schedule."""
 
-    # of the steps: first control
+    # share of the run before the first control
     start: Share = 0.15
-    # passes over the training views, after which the first control comes if that is earlier (Ref.: 5)
+    # passes over the training views before the first control, if that is earlier than `start` (Ref.: 5)
     start_passes: Annotated[float | None, Range(0, 1e6, above=True, below=True)] = None
-    # of the steps: no control from here on (Ref.)
+    # share of the run after which no control comes (Ref.)
     stop: Share = 0.5
-    # of the steps between two controls, at least one pass over the training views
+    # share of the run between two controls, at least one pass over the training views
     every: Annotated[float, Range(0, 1, above=True)] = 0.05
-    # passes over the training views between two controls, if these are fewer steps (Ref.: 2)
+    # passes over the training views between two controls, if that is less than `every` (Ref.: 2)
     every_passes: Annotated[float | None, Range(0, 1e6, above=True, below=True)] = None
-    # passes over the training views before statistics are gathered, if the first control leaves the time (Ref.: 3)
+    # passes over the training views before statistics begin, if the first control comes later (Ref.: 3)
     observe_passes: Annotated[float, Range(0, 1e6, below=True)] = 0.0
     # mean norm of the 2D gradient, in units of half the image
     gradient_threshold: Annotated[float, Range(0, 1e6, above=True, below=True)] = 1e-4
-    # the threshold grows with this power of lambda / 0.002: anchors cost bits
+    # the threshold grows with this power of lambda / 0.002, because anchors cost bits
     rate_exponent: Annotated[float, Range(0, 2)] = 1 / 3
-    # a primitive seen less often is not judged (Ref.: more than 40), ...
+    # a primitive that was seen less often is not judged (Ref.: more than 40), unless `minimum_share` allows it
     minimum_views: Annotated[int, Range(0, 1 << 31, below=True)] = 20
-    # ... unless it was seen in this share of the steps between two controls: where these are few, no primitive is seen
-    # 40 times. Above 1 it takes several controls, and needs statistics that outlast them (`reset_all` false).
+    # a primitive that was seen in this share of the steps between two controls is judged, too: in short runs none is
+    # seen 40 times. A share above 1 takes several controls, and statistics that outlast them (`reset_all` false).
     minimum_share: Annotated[float, Range(0, 1e6, above=True, below=True)] = 2.0
-    # anchors with less opacity, summed over K, averaged over views, are removed
+    # an anchor with less opacity is removed: the sum over its K primitives, averaged over the views
     opacity_threshold: Annotated[float, Range(0, 1e3, below=True)] = 5e-4
-    # an anchor in view less often is not removed for its opacity (Ref.: 1) ...
+    # an anchor that was in view less often keeps its place with any opacity (Ref.: 1)
     opacity_views: Annotated[int, Range(1, 1 << 31, below=True)] = 5
-    # ... nor in a smaller share of the steps between two controls (Ref.: 0)
+    # an anchor in view in a smaller share of the steps between two controls keeps its place, too (Ref.: 0)
     opacity_share: Annotated[float, Range(0, 1e6, below=True)] = 0.1
-    # after a control all statistics start anew (Ref.: true), else of what was judged
+    # true: all statistics start anew after a control (Ref.); false: only those of judged primitives
     reset_all: bool = False
-    # with which a candidate for a cell of 16, 4, 1 voxels is kept (Ref.: 0.5, 0.75, 0.875)
+    # probabilities of keeping a candidate for a cell of 16, 4, 1 voxels (Ref.: 0.5, 0.75, 0.875)
     growth_probabilities: Annotated[tuple[float, float, float], Range(0, 1)] = (0.5, 0.25, 0.125)
     # cells of 4 and 1 voxels are tried only in a control that has grown anchors in larger ones (Ref.: true)
     finer_needs_coarser: bool = False
-    # of all blending weights in training views: what adds no more is left out of the file
+    # share of all blending weights in the training views: primitives that together add no more are left out of the
+    # file
     idle_share: Annotated[float, Range(0, 1, below=True)] = 0.002
-    # of the steps: the anchors that are not worth their bits are removed
+    # shares of the run at which anchors that are not worth their bits are removed
     prune_at: Shares = (0.3, 0.5, 0.6, 0.7)
-    # what a mean squared change of the training views costs, in units of the loss, as pruning reckons
+    # price that pruning puts on a mean squared change of the training views, in units of the loss
     # (`training/structure/pruning.py`)
     prune_worth: Annotated[float, Range(0, 1e9, above=True, below=True)] = 40.0
-    # by which a bit is cheaper to it where training views are few: what adds little may be all that one view has
+    # discount on the price of a bit in pruning, if training views are few: an anchor that adds little may be all that
+    # one view has
     prune_less: Share = 0.5
 
 
@@ -171,73 +173,72 @@ class ControlConfig:
 class TrainingConfig:
     """Rate-distortion optimization (Sec. 3.4)."""
 
-    # updates of the scene, after `views_per_step` views each; all schedules are shares of them
+    # updates of the scene, each after `views_per_step` views; all schedules are shares of the steps
     steps: Annotated[int, Range(1, 10_000_000)] = 30_000
-    # views of a step, of all processes together (torchrun): learning rates go with the root of it and Adam's betas with
-    # its power (`training/optimizers.py`); as many views in all need as many times fewer steps
+    # views of a step, in all processes together (torchrun). Learning rates are multiplied by its root, and Adam's betas
+    # raised to its power (`training/optimizers.py`). Divide `steps` by it to train on as many views in all.
     views_per_step: Annotated[int, Range(1, 1024)] = 1
     seed: Annotated[int, Range(0, (1 << 31) - 1)] = 0
-    # what a run decides for itself in place of these settings (`training/plan.py`, not in the paper): all of its rules,
-    # none, or "all but NAME, NAME"; `compgs train --plan` prints what they come to
+    # rules that may replace these settings (`training/plan.py`, not in the paper): all, none, or "all but NAME, NAME";
+    # `compgs train --plan` prints the decisions
     rules: str = "all"
-    # weight of the rate; 0: the entropy networks learn what the latents cost, these do not care
+    # weight of the rate, the price of a bit; 0: bits cost nothing
     lmbda: Annotated[float, Range(0, 100)] = 0.002
-    # bytes of the file to aim at: lambda, from its setting on, follows it
+    # bytes of the file to aim at: lambda begins at its setting and is moved towards this size
     target_bytes: Annotated[int | None, Range(1, 1 << 40)] = None
     # bits: true bits, normalized so that lambda means the same as in the paper; elements: sum over the tensors of mean
     # bits per element (Ref.)
     rate: Literal["bits", "elements"] = "bits"
-    # of the steps before the rate joins the loss (Ref.: 3 000 of 30 000)
+    # share of the run before the rate joins the loss (Ref.: 3 000 of 30 000 steps)
     rate_start: Share = 0.1
-    # steps between two of which the rate is in the loss, as many times as steps pass: the latents change little from
-    # one to the next, and a step without it takes a sixth less time (not in the paper)
+    # the rate is in the loss of every so many-th step, multiplied by as many: latents change little from one step to
+    # the next, and a step without the rate takes a sixth less time (not in the paper)
     rate_every: Annotated[int, Range(1, 1000)] = 4
-    # of the steps until which photographs of 160 000 pixels and more are halved, larger ones more than once; 0: never
-    # (not in the paper; `training/shortcuts/coarse.py`)
+    # share of the run in which photographs of 160 000 pixels and more have their sides halved, larger ones more than
+    # once; 0: never (not in the paper; `training/shortcuts/coarse.py`)
     coarse_until: Share = 0.7
     # (1 - w) L1 + w (1 - SSIM) (3DGS)
     ssim_weight: Share = 0.2
-    # of the mean gradient of a view's primitives: of smaller ones only a sample is led through the prediction networks,
-    # as much larger, on the CPU; 0: all are; 1 is faster, and loses detail (not in the paper;
-    # `tensors/gradient_sampling.py`)
+    # gradients below this share of the mean of a view's primitives are sampled on the CPU, and scaled up to match;
+    # 0: none are; 1 is faster, and loses detail (not in the paper; `tensors/gradient_sampling.py`)
     sampled_gradients: Annotated[float, Range(0, 100)] = 0.1
-    # of the mean gradient: anchors of a view whose primitives have less, as they stand behind others, are passed over
-    # until a step with the rate looks at them again; 0: none are (not in the paper; `training/shortcuts/hidden.py`)
+    # a step skips anchors that were hidden when its view was last rendered, with gradients below this share of the
+    # mean; steps with the rate render all of them; 0: none are skipped (not in the paper;
+    # `training/shortcuts/hidden.py`)
     passed_over: Share = 0.03
-    # mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
+    # weight of the mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
     scale_weight: Annotated[float, Range(0, 1e6, below=True)] = 0.01
-    # quantization steps per training step
+    # learning rate of the embeddings at the start and at the end, in quantization steps per training step
     embedding_lr: LearningRates = (0.05, 3e-4)
-    # Ref., as the following four
+    # learning rate of the log scales, at the start and at the end (Ref., as the following four)
     log_scale_lr: LearningRates = (0.007, 0.007)
     translation_lr: LearningRates = (2e-3, 2e-5)
     covariance_lr: LearningRates = (4e-3, 4e-5)
     opacity_lr: LearningRates = (2e-3, 2e-5)
     color_lr: LearningRates = (8e-3, 8e-5)
-    # of all these rates (Sec. 4.1; Ref.: exponential)
+    # course of all these learning rates (Sec. 4.1; Ref.: exponential)
     schedule: Literal["cosine", "exponential"] = "cosine"
-    # of the steps in which the heads come up to their learning rates
+    # share of the run in which the heads' learning rates rise to their start
     head_warm_up: Share = 0.05
-    # of the entropy model (Ref.: 2e-4 -> 1e-5)
+    # learning rate of the entropy model, at the start and at the end (Ref.: 2e-4 -> 1e-5)
     entropy_lr: LearningRates = (5e-3, 1e-4)
-    # steps for which entropy_lr is meant: a shorter run multiplies it by as much as it is shorter, so that the networks
-    # get as far; 0: as it is given
+    # steps of the run for which `entropy_lr` is meant: a run of half the steps doubles it, so that the networks get as
+    # far; 0: `entropy_lr` as it is
     entropy_lr_steps: Annotated[int, Range(0, 10_000_000)] = 0
-    # of the steps before the networks' weights are trained as they will be stored
+    # share of the run after which the networks train with the weights of the file
     quantized_weights: Share = 0.8
-    # in which the networks of opacity and color compute; bfloat16 is meant for GPUs
+    # number format of the networks of opacity and color; bfloat16 is meant for GPUs
     appearance_dtype: Literal["float32", "bfloat16"] = "float32"
-    # of the steps before the likelihood sees symbols in place of noise (soft then hard)
+    # share of the run after which the likelihood sees symbols, not noise (soft then hard)
     hard_rate: Share = 0.8
-    # of the steps, the last ones: the file holds the mean of them; 0: where the last one went (not in the paper)
+    # the file holds the mean of this last share of the run; 0: the end of the last step (not in the paper)
     averaged: Share = 0.1
-    # an affine change of color for each training view, for photographs of differing exposure or white balance: learned
-    # beside the scene, and kept out of the file (`training/step/exposures.py`)
+    # true: learn an affine change of color for each training view, beside the scene, for photographs of differing
+    # exposure or white balance; the file does not hold it (`training/step/exposures.py`)
     exposure: bool = False
-    # of the primitives, that a step does without, where training views are few
+    # share of the primitives that a step leaves out at random, if training views are few
     left_out: Annotated[float, Range(0, 0.5)] = 0.2
-    # cameras of training views that the file keeps to look from, at most: one for each 100 anchors, and three at
-    # least; 0: none
+    # cameras of training views that the file keeps, at most: one for each 100 anchors, and three at least; 0: none
     viewpoints: Annotated[int, Range(0, MAX_VIEWPOINTS)] = 12
     # minutes between two checkpoints; one is also written when the run is interrupted
     checkpoint_minutes: Annotated[float, Range(0, 1e6, above=True, below=True)] = 5.0
@@ -250,42 +251,42 @@ class SplatConfig:
     Schedules are fractions of its 30 000 steps, with floors for short runs (`training/splats/densification.py`).
     """
 
-    # degree of the spherical harmonics at the end
+    # degree of the spherical harmonics at the end of the run
     harmonics: Annotated[int, Range(0, 3)] = 3
-    # of the steps between two degrees (1 000 of 30 000)
+    # share of the run between two degrees (1 000 of 30 000 steps)
     harmonics_every: Share = 1 / 30
-    # of the splats that the points become
+    # opacity of the splats that the points become
     initial_opacity: Annotated[float, Range(0, 1, above=True, below=True)] = 0.1
-    # scene extents per step
+    # learning rate of positions at the start and at the end, in scene extents per step
     position_lr: LearningRates = (1.6e-4, 1.6e-6)
-    # of harmonic coefficients of degree 0
+    # learning rate of harmonic coefficients of degree 0
     color_lr: LearningRate = 2.5e-3
-    # of the degrees above: a twentieth
+    # learning rate of higher degrees: a twentieth
     harmonics_lr: LearningRate = 1.25e-4
-    # of logits
+    # learning rate of opacities, as logits
     opacity_lr: LearningRate = 0.05
     log_scale_lr: LearningRate = 5e-3
-    # of quaternions
+    # learning rate of quaternions
     rotation_lr: LearningRate = 1e-3
-    # of the steps (500 of 30 000)
+    # share of the run before densification starts (500 of 30 000 steps)
     densify_start: Share = 1 / 60
-    # of the steps (15 000)
+    # share of the run after which densification stops (15 000 of 30 000 steps)
     densify_stop: Share = 0.5
-    # of the steps (100)
+    # share of the run between two densifications (100 of 30 000 steps)
     densify_every: Annotated[float, Range(0, 1, above=True)] = 1 / 300
     # mean norm of the 2D gradient, in units of half the image
     gradient_threshold: Annotated[float, Range(0, 1e6, above=True, below=True)] = 2e-4
     # scene extents: larger splats are split, smaller ones cloned
     split_size: Annotated[float, Range(0, 1e6, above=True, below=True)] = 0.01
-    # splats with less are removed
+    # splats with less opacity are removed
     prune_opacity: Annotated[float, Range(0, 1, below=True)] = 0.005
     # scene extents: larger splats are removed once opacities have been reset
     prune_size: Annotated[float, Range(0, 1e6, above=True, below=True)] = 0.1
-    # of the steps (3 000) between two resets of the opacities
+    # share of the run between two resets of the opacities (3 000 of 30 000 steps)
     reset_every: Annotated[float, Range(0, 1, above=True)] = 0.1
-    # what opacities are reset to, where they are above; above prune_opacity
+    # opacity to which a reset lowers larger ones; above `prune_opacity`
     reset_opacity: Annotated[float, Range(0, 1, above=True, below=True)] = 0.01
-    # growth stops here; the largest published scenes have about as many
+    # growth stops at this number of splats; the largest published scenes have about as many
     max_splats: Annotated[int, Range(1, 1 << 26)] = 6_000_000
 
 

@@ -46,7 +46,7 @@ class Decode(DecodingCommand, FileArgument):
     an octree level ("level 6"; `compgs info` lists them)."""
 
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace what is in FOLDER already."""
+    """Replace the content of FOLDER."""
 
     def run(self) -> None:
         if manifest := tiles_manifest(self.file):

@@ -63,7 +63,7 @@ class Encode(DecodingCommand, ReadingOptions):
         Path | None,
         arg(metavar="SCENE", help_behavior_hint="(default for a run: its own, where it still is)"),
     ] = None
-    """Scene whose photographs show what contributes and what is lost."""
+    """Scene whose training views measure the contribution of a primitive, and whose held-out views measure the loss."""
 
     cameras: Annotated[str | None, arg(metavar="N|none", help_behavior_hint="(default: the run's, 12)")] = (
         None
@@ -147,7 +147,7 @@ class Encode(DecodingCommand, ReadingOptions):
         from compgs.evaluation.reduction import reduce_file
 
         cameras, held_out, where = self.judges(data)
-        say(f"what contributes, and what is lost: {where}")
+        say(f"contributions and loss, measured from: {where}")
         with counting("looking at cameras") as progress:
             data, reduction = reduce_file(
                 data,

@@ -27,7 +27,7 @@ OF_TILES = ("name", "bytes", "sha256", "anchors", "coupled_primitives", "memory"
 
 @dataclass(frozen=True, kw_only=True)
 class Info(JsonOption, Command, SceneFileOrRunArgument):
-    """Show what is in a file: bytes of every component; of a .cgs file also bits per anchor and coupled primitive.
+    """Show the parts of a file: bytes of every component; for a .cgs file also bits per anchor and coupled primitive.
 
     Then which beginnings of the file are scenes: after how many bytes the anchors up to each octree level are there. Of
     a scene in tiles: its tiles, and what each takes.

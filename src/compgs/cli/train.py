@@ -170,8 +170,8 @@ class Train(ComputingCommand, SceneOptions):
     folder)."""
 
     viewer: FlagCreatePairsOff[bool] = False
-    """Show the scene as it grows, in the browser, for less than a tenth of the training's speed; what comes out is the
-    same (needs `pip install '.[view]'` in the project's folder)."""
+    """Show the scene as it grows, in the browser, for less than a tenth of the training's speed; the file is the same
+    (needs `pip install '.[view]'` in the project's folder)."""
 
     viewer_host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address at which the viewer listens; 0.0.0.0 is all addresses of this machine."""
