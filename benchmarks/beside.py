@@ -1,7 +1,7 @@
 """Beside what people would pick instead: one scene as a .cgs file, and as .spz and .sog of several origins: one table.
 
     python benchmarks/beside.py SCENE -o OUT --ours FILE.cgs [--plain 3DGS.ply] [-r 2] [--settle 500]
-        [--lpips-weights FILE] [--mbit 10] [--times 3] [--no-browser]
+        [--refine 100] [--lpips-weights FILE] [--mbit 10] [--times 3] [--no-browser]
 
 The rows: the .cgs file; the .spz and .sog that `compgs export` makes of it; with --plain (from `compgs train --method
 3dgs`) the same splats as .spz and .sog, and four of five of them pruned, the others settled for --settle steps (the
@@ -97,6 +97,7 @@ def main() -> None:
     parser.add_argument("--plain", type=Path)
     parser.add_argument("-r", "--downscale", type=int, default=1)
     parser.add_argument("--settle", type=int, default=500)
+    parser.add_argument("--refine", type=int, default=100)
     parser.add_argument("--lpips-weights", type=Path)
     parser.add_argument("--mbit", type=float, default=10.0)
     parser.add_argument("--times", type=int, default=3)
@@ -122,7 +123,7 @@ def files(options: argparse.Namespace) -> Iterator[Entry]:
     yield Entry("ours, `.cgs`", options.ours)
     ply = out / "ours.ply"
     if not ply.is_file():
-        compgs.export(options.ours, ply)
+        compgs.export(options.ours, ply, refine=options.refine)
     for kind in ("spz", "sog"):
         yield Entry(f"ours, exported to `.{kind}`", written(ply, out / f"ours.{kind}"))
     if options.plain is None:
