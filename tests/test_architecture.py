@@ -57,6 +57,7 @@ ALLOWED = {
     "tensors": BASE | {"model", "render"},
     "entropy": BASE | {"tensors", "ordering"},
     "losses": BASE | {"tensors"},
+    "stereo": BASE | {"scene"},
     "lpips": BASE,
     "metrics": BASE | {"lpips"},
     "stored_weights": BASE | {"model", "entropy"},
@@ -66,7 +67,7 @@ ALLOWED = {
     | {"model", "render", "devices", "codec", "methods"},  # up for a method's own files, which name it
     "training": BASE
     | {"scene", "render", "model", "tensors", "devices", "entropy", "losses", "metrics", "trained_model"}
-    | {"stored_weights", "codec", "ordering"},  # what positions and masks take, for a size that is asked for
+    | {"stereo", "stored_weights", "codec", "ordering"},  # what positions and masks take, for a size that is asked for
     "methods": BASE
     | {"scene", "model", "entropy", "render", "tensors", "devices", "losses", "metrics", "codec", "formats"}
     | {"training", "trained_model", "stored_weights", "ordering"},

@@ -229,7 +229,7 @@ def begin(
     begun = Begun(source, digest(splats), looking, placed, config)
     run.save(folder_of(output), begun)
     device = chosen_device(device)
-    plan = plan_for(scene, config, training_device(device))
+    plan = plan_for(scene, config, training_device(device)).with_the_points_at_hand()
     return Compression(begun, splats, scene, output, device, plan, deadline=deadline)
 
 
@@ -265,7 +265,7 @@ def resumed(output: Path, source: Path | None = None, *, device: str | None = No
     scene, _ = scene_of(splats, begun.placed, begun.source, begun.config)
     there = (folder / CHECKPOINT_NAME).is_file()
     device = chosen_device(device)
-    plan = plan_for(scene, begun.config, training_device(device))
+    plan = plan_for(scene, begun.config, training_device(device)).with_the_points_at_hand()
     return Compression(begun, splats, scene, output, device, plan, goes_on=there)
 
 

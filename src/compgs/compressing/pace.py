@@ -52,7 +52,7 @@ def seconds_per_step(
     more than a part.
     """
     end = time.monotonic() + TRIED_PART * seconds
-    plan = plan_for(scene, config, chosen_device(device))
+    plan = plan_for(scene, config, chosen_device(device)).with_the_points_at_hand()
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
     told: list[TrainingStatus] = []
 

@@ -39,6 +39,9 @@ MOST_COUPLED = 64  # primitives of an anchor that a file can hold
 # Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
 # up for an error.
 LOOKED_AT, PRUNED_BY = 48, 256
+# Pixels of the photographs between two points that are found in them before a large capture's run: 65 000 points on
+# Truck, half as many as it has. Without them walls and trees stay blurred (docs/results/truck.md).
+POINTS_APART = 12.0
 COARSE_PIXELS = (
     160_000  # a photograph of so many pixels, and of more, is halved at first (`shortcuts/coarse.py`)
 )
@@ -121,6 +124,12 @@ RULES: tuple[Rule, ...] = (
         "lambda above 0.002: voxels grow with its power model.voxel_rate_exponent",
         lambda s: s.lmbda > USUAL_LAMBDA,
         "results/decisions.md",
+    ),
+    Rule(
+        "dense_points", "dense_points", lambda c, s, pixels: POINTS_APART,
+        "20,000 anchors and more, 10 training views and more: points every 12 pixels, where there are none",
+        lambda s: s.large and s.views >= 10,
+        "results/truck.md",
     ),
     Rule(
         "twice_coupled", "coupled_primitives", lambda c, s, k: min(2 * k, MOST_COUPLED),
@@ -277,6 +286,8 @@ class Plan:
     passed_over: float  # of the mean gradient: anchors that showed less are passed over; 0: none are
     start: Start
     reasons: Mapping[str, str] = field(default_factory=dict)  # by field, of those that a rule has set
+    # of the photographs, between two points that are found in them before the run (`compgs.stereo`); 0: none are
+    dense_points: float = 0.0
 
     def model(self, settings: ModelConfig) -> ModelConfig:
         """The settings of the model, with what the plan has decided in their place."""
@@ -291,6 +302,11 @@ class Plan:
             voxel_spacings=self.voxel_spacings,
             dilation=self.dilation,
         )
+
+    def with_the_points_at_hand(self) -> "Plan":
+        """The same plan, but no points are looked for in the photographs."""
+        reasons = {name: reason for name, reason in self.reasons.items() if name != "dense_points"}
+        return replace(self, dense_points=0.0, reasons=reasons)
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON has it."""
@@ -422,6 +438,7 @@ def _by_settings(config: Config, start: Start) -> dict[str, Any]:
         "rate_every": 1,
         "sampled_gradients": 0.0,
         "passed_over": 0.0,
+        "dense_points": 0.0,
     }
 
 
@@ -463,4 +480,5 @@ def _expected(plan: Plan) -> dict[str, tuple[bool, str]]:
         "coarse_until": number("coarse_until", 1.0),
         "sampled_gradients": number("sampled_gradients", 100.0),
         "passed_over": number("passed_over", 1.0),
+        "dense_points": number("dense_points", 1e4),
     }

@@ -11,11 +11,13 @@ from compgs.codec.format import LARGEST_DILATION, SMALLEST_DILATION
 from compgs.config import MAX_VIEWPOINTS, Config, ModelConfig
 from compgs.errors import ConfigError
 from compgs.numerics.nearest import nearest
+from compgs.progress import shown_count
 from compgs.render.settings import as_angle
 from compgs.scene.points import colors_at, median_spacing, voxel_grid
 from compgs.scene.viewpoints import choose_viewpoints, up_direction
-from compgs.scene.views import Scene
+from compgs.scene.views import Points, Scene
 from compgs.scene.world import local_scene, world_offset
+from compgs.stereo import dense_points
 from compgs.trained_model import TrainedModel
 from compgs.training.plan import Plan, Start, grid_spacings, head_bits, lambda_for, plan
 from compgs.training.run.distributed import world
@@ -45,7 +47,9 @@ def plan_for(scene: Scene, config: Config, device: torch.device, tiles: int = 1)
     """What a run on a scene decides; of a capture in so many tiles, for all of their runs. Raises ConfigError."""
     here = local_scene(scene, world_offset(scene))
     anchors = len(anchor_grid(here, replace(config.model, voxel_spacings=grid_spacings(config)))[0])
-    return plan(config, start_of(scene, config, device, max(1, round(anchors / tiles))))
+    planned = plan(config, start_of(scene, config, device, max(1, round(anchors / tiles))))
+    # A tile's photographs show more than the tile.
+    return planned if tiles == 1 else planned.with_the_points_at_hand()
 
 
 def initial_model(
@@ -67,6 +71,10 @@ def initial_model(
     m = replace(config.model, voxel_spacings=spacings)
     coordinates, voxel_size = anchor_grid(scene, m)
     chosen = planned or plan(config, start_of(scene, config, device, len(coordinates)))
+    if chosen.dense_points > 0:
+        room = m.max_anchors - len(coordinates)
+        scene = with_dense_points(scene, chosen.dense_points, room, device)
+        coordinates, _ = anchor_grid(scene, replace(m, voxel_size=voxel_size))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.training.seed)
         model = TrainedModel(
@@ -93,6 +101,24 @@ def initial_model(
         model.up = up_direction(cameras)
         model.angular_dilation = angular_dilation(chosen.dilation, cameras)
     return model
+
+
+def with_dense_points(scene: Scene, pixels: float, most: int, device: torch.device) -> Scene:
+    """A scene with points every so many pixels of its photographs, also where structure from motion found none; so many
+    more at most.
+    """
+    with shown_count(None, "looking for points, photographs") as progress:
+        found = dense_points(scene, pixels, device, progress)
+    kept = spread_evenly(len(found), most)
+    known = scene.points
+    positions = np.concatenate([known.positions, found.positions[kept].astype(known.positions.dtype)])
+    return replace(scene, points=Points(positions, np.concatenate([known.colors, found.colors[kept]])))
+
+
+def spread_evenly(count: int, most: int) -> np.ndarray:
+    """Indices of at most so many of `count` things, evenly spread."""
+    chosen = max(0, min(count, most))
+    return np.arange(chosen) * count // max(1, chosen)
 
 
 def angular_dilation(pixels: float, cameras: Sequence[Camera]) -> float:

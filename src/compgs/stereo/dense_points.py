@@ -1,0 +1,56 @@
+"""Points where structure from motion found few: surfaces without corners, leaves, what only some photographs show.
+
+Anchors begin at the points of a scene, and adaptive control adds some near those that there are. Where a scene begins
+without any (on Truck: walls, the ground, trees behind), blurs of a few large primitives stay to the end. With these
+points Truck gains half a decibel (docs/results/truck.md).
+"""
+
+import numpy as np
+import torch
+
+from compgs.progress import Counting
+from compgs.scene.views import Points, Scene
+from compgs.stereo.fusion import Depths, agreed, thinned
+from compgs.stereo.looks import looks_of, small_camera
+from compgs.stereo.neighbours import asked_of, neighbours_of, sight_of
+from compgs.stereo.plane_sweep import swept
+
+SWEPT = 110  # photographs whose distances are found, evenly spread: the others are looked at as neighbours
+FEWEST_NEIGHBOURS = 2
+
+
+@torch.no_grad()
+def dense_points(
+    scene: Scene,
+    spacing: float,  # pixels of the training photographs between two points, about
+    device: torch.device,
+    progress: Counting | None = None,
+) -> Points:
+    """The points to add to a scene's own, which must be there: they say where to look. Raises UnreadableImage.
+
+    The same photographs give the same points on the same kind of device.
+    """
+    known = scene.points.positions
+    looks = looks_of(scene.train_views, device)
+    cameras = [look.camera for look in looks]
+    sights = [sight_of(camera, asked_of(known)) for camera in cameras]
+    chosen = [i * len(looks) // min(SWEPT, len(looks)) for i in range(min(SWEPT, len(looks)))]
+    depths = []
+    for done, number in enumerate(chosen):
+        if progress is not None:
+            progress(done, len(chosen))
+        sight, others = sights[number], neighbours_of(number, cameras, sights)
+        if sight is None or len(others) < FEWEST_NEIGHBOURS:
+            continue
+        look = looks[number]
+        inverse, step = swept(look, [looks[other] for other in others], sight.nearest, sight.farthest)
+        found = inverse.cpu().numpy()
+        if look.counted is not None:
+            found = np.where(look.counted, found, 0)
+        depths.append(Depths(look.camera, look.color, found, step))
+    if progress is not None:
+        progress(len(chosen), len(chosen))
+    if not depths:
+        return Points(known[:0], scene.points.colors[:0])
+    full = scene.train_views[0].camera
+    return thinned(agreed(depths), spacing * small_camera(full).width / full.width, known)

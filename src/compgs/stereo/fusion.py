@@ -1,0 +1,102 @@
+"""What several photographs agree on, and one point for each cell of it that looks equally large.
+
+A pixel's place holds where two other photographs have found the same distance. Places are gathered in cells whose size
+goes with the distance they were seen from, in powers of two: what is far is large in the world and small in the
+picture.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from compgs.cameras import Camera
+from compgs.numerics.nearest import nearest
+from compgs.scene.views import Points
+
+ASKED = 10  # photographs that a pixel's place is looked up in, those taken nearest
+AGREEING = 2  # of these: they must have found it, too
+FEWEST = 3  # places in a cell: fewer are mistakes mostly
+APART = 1.4  # cells: no point is added so near to one that there is; structure from motion knows it better
+
+
+@dataclass(frozen=True)
+class Depths:
+    """Distances that were found in a photograph."""
+
+    camera: Camera
+    color: np.ndarray  # [H, W, 3] uint8
+    inverse: np.ndarray  # [H, W] float32, 1 / world units along the axis; 0: not known
+    tolerance: float  # of the inverse
+
+
+@dataclass(frozen=True)
+class Places:
+    """Points of surfaces."""
+
+    positions: np.ndarray  # [P, 3] float64, world units
+    colors: np.ndarray  # [P, 3] uint8
+    footprints: np.ndarray  # [P] float64, world units: what a pixel of the small photograph covers there
+
+
+def agreed(depths: Sequence[Depths]) -> Places:
+    """Places of all pixels that enough other photographs confirm."""
+    centers = np.stack([found.camera.center for found in depths])
+    parts = []
+    for number, found in enumerate(depths):
+        order = np.argsort(np.linalg.norm(centers - centers[number], axis=1), kind="stable")
+        parts.append(_confirmed(found, [depths[i] for i in order if i != number][:ASKED]))
+    return Places(
+        np.concatenate([part.positions for part in parts]),
+        np.concatenate([part.colors for part in parts]),
+        np.concatenate([part.footprints for part in parts]),
+    )
+
+
+def _confirmed(found: Depths, others: Sequence[Depths]) -> Places:
+    camera = found.camera
+    row, column = np.nonzero(found.inverse > 0)
+    distance = 1.0 / found.inverse[row, column].astype(np.float64)
+    local = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy], 1)
+    local = np.concatenate([local, np.ones((len(local), 1))], 1) * distance[:, None]
+    positions = (local - camera.translation) @ camera.rotation
+    agreeing = np.zeros(len(positions), np.int64)
+    for other in others:
+        agreeing += _agrees(other, positions)
+    kept = agreeing >= AGREEING
+    footprints = distance[kept] / camera.fx
+    return Places(positions[kept], found.color[row[kept], column[kept]], footprints)
+
+
+def _agrees(other: Depths, positions: np.ndarray) -> np.ndarray:
+    """[P] bool: whether a photograph has found the same distance where it shows positions [P, 3]."""
+    camera = other.camera
+    x, y, z = (positions @ camera.rotation.T + camera.translation).T
+    ahead = z > 0
+    safe = np.where(ahead, z, 1.0)
+    column, row = np.floor(camera.fx * x / safe + camera.cx), np.floor(camera.fy * y / safe + camera.cy)
+    inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    theirs = other.inverse[np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)]
+    return inside & (theirs > 0) & (np.abs(theirs - 1.0 / safe) < other.tolerance)
+
+
+def thinned(places: Places, pixels: float, known: np.ndarray) -> Points:
+    """One point, the mean, of each cell of about so many pixels of the small photographs, away from `known` [P, 3].
+
+    Cells are half as large up to as large: their sides are powers of two.
+    """
+    levels = np.floor(np.log2(places.footprints * pixels))
+    sides = np.exp2(levels)
+    keys = np.concatenate(
+        [np.floor(places.positions / sides[:, None]).astype(np.int64), levels[:, None].astype(np.int64)], 1
+    )
+    unique, cell, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    cell = cell.reshape(-1)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(cell, column, len(count)) for column in values.T], 1) / count[:, None]
+
+    positions, colors = mean(places.positions), mean(places.colors.astype(np.float64))
+    distances, _ = nearest(known, positions, 1)
+    kept = (count >= FEWEST) & (distances.reshape(-1) > APART * np.exp2(unique[:, 3]))
+    return Points(positions[kept], np.round(colors[kept]).astype(np.uint8))

@@ -1,0 +1,123 @@
+"""Dense points, against the surfaces of a scene that is known: rays are traced to where the points are said to be."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from compgs.cameras import Camera
+from compgs.config import Config
+from compgs.scene import ray_tracing
+from compgs.scene.generated import camera_path, observe, still_life
+from compgs.scene.views import Points, Scene, View
+from compgs.stereo import dense_points
+from compgs.stereo.fusion import Places, thinned
+from compgs.stereo.neighbours import neighbours_of, sight_of
+from compgs.training.plan import plan
+from compgs.training.start import initial_model, spread_evenly, start_of
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def solids() -> ray_tracing.Solids:
+    return still_life(np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def scene(solids: ray_tracing.Solids) -> Scene:
+    """The still life in 32 photographs, with a tenth of the points that would be found of it."""
+    chance = np.random.default_rng(0)
+    cameras = camera_path(32, 320, 240)
+    photographs = [ray_tracing.render(solids, camera) for camera in cameras]
+    names = [f"{number}.png" for number in range(len(cameras))]
+    _, points = observe(solids, cameras, names, photographs, chance)
+    views = tuple(View(*view) for view in zip(names, cameras, photographs, strict=True))
+    sparse = Points(points.positions[::10], points.colors[::10])
+    return Scene(name="still life", points=sparse, train_views=views, test_views=())
+
+
+@pytest.fixture(scope="module")
+def found(scene: Scene) -> Points:
+    return dense_points(scene, 8.0, CPU)
+
+
+def misses(solids: ray_tracing.Solids, positions: np.ndarray, cameras: list[Camera]) -> np.ndarray:
+    """[P] how far positions are from what a ray to them hits, over its length; of the best of the cameras."""
+    best = np.full(len(positions), np.inf)
+    for camera in cameras:
+        way = positions - camera.center
+        length = np.linalg.norm(way, axis=1)
+        origins = np.repeat(camera.center[None], len(way), 0)
+        best = np.minimum(best, np.abs(ray_tracing.trace(solids, origins, way / length[:, None]) / length - 1))
+    return best
+
+
+def test_dense_points_lie_on_the_surfaces(scene: Scene, solids: ray_tracing.Solids, found: Points) -> None:
+    assert len(found) > 3 * len(scene.points)
+    cameras = [view.camera for view in scene.train_views]
+    assert np.mean(misses(solids, found.positions, cameras) < 0.02) > 0.9
+    # ... and random points between them do not, so that the measure says something
+    chance = np.random.default_rng(1)
+    moved = found.positions * chance.uniform(0.7, 1.3, (len(found), 1))
+    assert np.mean(misses(solids, moved, cameras) < 0.02) < 0.4
+
+
+def test_the_same_photographs_give_the_same_points(scene: Scene, found: Points) -> None:
+    again = dense_points(scene, 8.0, CPU)
+    np.testing.assert_array_equal(again.positions, found.positions)
+    np.testing.assert_array_equal(again.colors, found.colors)
+
+
+def test_masked_pixels_have_no_points(scene: Scene) -> None:
+    nothing = np.zeros((240, 320), bool)
+    masked = replace(scene, train_views=tuple(replace(view, counted=nothing) for view in scene.train_views))
+    assert len(dense_points(masked, 8.0, CPU)) == 0
+
+
+def test_views_that_see_no_points_say_nothing(scene: Scene) -> None:
+    far = Points(scene.points.positions + 1e6, scene.points.colors)
+    assert len(dense_points(replace(scene, points=far), 8.0, CPU)) == 0
+
+
+def test_neighbours_stand_a_little_aside() -> None:
+    def camera(x: float) -> Camera:
+        pose = np.eye(4)
+        pose[0, 3] = -x
+        return Camera(pose, 100.0, 100.0, 50.0, 50.0, 100, 100)
+
+    points = np.random.default_rng(0).uniform((-3, -3, 9.5), (3, 3, 10.5), (500, 3))
+    # 10 units before the points a baseline of .12 is 1.2 units.
+    cameras = [camera(x) for x in (0.0, 0.05, 0.6, 1.2, 1.3, 2.4, 6.0)]
+    assert neighbours_of(0, cameras, [sight_of(c, points) for c in cameras]) == [3, 4, 2, 5]
+
+
+def test_cells_grow_with_the_distance_and_known_places_stay_alone() -> None:
+    positions = np.repeat([[0.0, 0, 0], [0.4, 0, 0], [10, 0, 0], [10.4, 0, 0], [20, 0, 0]], 3, 0) + 0.01
+    footprints = np.repeat([0.1, 0.1, 0.6, 0.6, 0.1], 3)
+    places = Places(positions, np.full((15, 3), 7, np.uint8), footprints)
+    kept = thinned(places, 2.5, np.array([[20.0, 0, 0]]))
+    # Cells of .25 part the first two, a cell of 1 unites the next two, and the last is known.
+    np.testing.assert_allclose(np.sort(kept.positions[:, 0]), [0.01, 0.41, 10.21])
+    assert len(thinned(replace(places, positions=positions + np.arange(15)[:, None]), 2.5, np.zeros((1, 3)))) == 0
+
+
+def test_a_run_begins_with_the_dense_points(scene: Scene, found: Points) -> None:
+    config = Config()
+    start = start_of(scene, config, CPU, 25_000)
+    assert plan(config, start).dense_points > 0
+    sparse = plan(config, start_of(scene, config, CPU, 300))
+    assert sparse.dense_points == 0
+    assert plan(config, start).with_the_points_at_hand().dense_points == 0
+    few = initial_model(scene, config, CPU, sparse).anchors
+    many = initial_model(scene, config, CPU, replace(sparse, dense_points=8.0)).anchors
+    assert few + 0.9 * len(found) < many <= few + len(found)
+    room = replace(config, model=replace(config.model, max_anchors=few + 10))
+    assert initial_model(scene, room, CPU, replace(sparse, dense_points=8.0)).anchors <= few + 10
+
+
+def test_a_choice_of_few_is_spread_evenly() -> None:
+    assert spread_evenly(10, 4).tolist() == [0, 2, 5, 7]
+    assert spread_evenly(3, 9).tolist() == [0, 1, 2]
+    assert spread_evenly(3, -1).tolist() == []
