@@ -83,4 +83,7 @@ def _moments(images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _mean(images: Tensor) -> Tensor:
-    return nn.functional.avg_pool2d(images, WINDOW, 1, WINDOW // 2, count_include_pad=False)
+    """Mean of each pixel's window in images [B, 1, H, W]: along rows, then along columns."""
+    reach = WINDOW // 2
+    rows = nn.functional.avg_pool2d(images, (1, WINDOW), 1, (0, reach), count_include_pad=False)
+    return nn.functional.avg_pool2d(rows, (WINDOW, 1), 1, (reach, 0), count_include_pad=False)
