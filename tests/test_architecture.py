@@ -129,7 +129,7 @@ def test_imports_point_one_way(file: Path) -> None:
 # What trains, and what it alone needs. Everything else computes with numpy and numba.
 HEAVY = {"torch", "scipy", "safetensors"}
 TRAINS = {
-    "tensors", "entropy", "losses", "stored_weights", "trained_model", "training", "codec.encoder",
+    "tensors", "entropy", "losses", "stored_weights", "stereo", "trained_model", "training", "codec.encoder",
     *(f"methods.parts.{name}" for name in ("vector_quantization", "fake_quantization", "significance")),
     "methods.compact_3dgs.tensors", "methods.c3dgs.sensitivity", "methods.c3dgs.shapes",
     *(f"methods.anchors.{part}" for part in ("networks", "prediction", "model", "trainer")),
