@@ -52,6 +52,12 @@ test("a scene is opened from the viewpoint that has most of it in its picture", 
   assert.deepEqual(firstView(ball, null, 1), { view: 0, isInside: false });
 });
 
+test("of viewpoints that show as much, the one that looks as most do comes first", () => {
+  const front = [-0.3, 0, 0.3].map((x) => looking([x, 0, -4], [0, 0, 0]));
+  const views = [looking([5, 0, 0], [0, 0, 0]), ...front, looking([0, 0, -0.5], [0, 0, 0])];
+  assert.equal(firstView(ball, { up: [0, -1, 0], views }, 1).view, 2);
+});
+
 test("one looks around where the cameras did, and turns about what they surrounded", () => {
   const of = (views) => firstView(ball, { up: [0, -1, 0], views }, 1).isInside;
   assert.equal(of(circle(8, 4).map((place) => looking(place, [0, 0, 0]))), false);

@@ -4,7 +4,7 @@ import type { Viewpoints } from "../src/codec/viewpoints.ts";
 import { Pose, type Vector, add, dot, unit } from "./pose.ts";
 
 export interface FirstView {
-  /** Number of the viewpoint that has most of the scene in its picture. */
+  /** Number of a viewpoint that has much of the scene in its picture, from the side that most viewpoints look from. */
   view: number;
   /** The cameras stand in the middle and look outwards: one looks around there. */
   isInside: boolean;
@@ -12,6 +12,8 @@ export interface FirstView {
 
 /** Anchors that are looked at, at most: more say nothing else. */
 const SAMPLES = 4000;
+/** Of the anchors of the viewpoint that has most in its picture: others with as many are as good. */
+const AS_GOOD = 0.8;
 /** Share of the picture's sides, beyond which an anchor is too near its edge to be counted. */
 const EDGE = 0.02;
 /** Of the mean of directions: cameras that look to all sides have less. */
@@ -30,7 +32,22 @@ export function firstView(
   if (!viewpoints) return { view: 0, isInside: false };
   const poses = viewpoints.views.map(({ position, rotation }) => Pose.of([...position] as Vector, rotation));
   const counts = viewpoints.views.map((lens, i) => seen(positions, poses[i]!, lens));
-  return { view: counts.indexOf(Math.max(...counts)), isInside: looksOutwards(poses, extent) };
+  return { view: amongFullest(poses, counts), isInside: looksOutwards(poses, extent) };
+}
+
+/**
+ * Of the viewpoints with many anchors in their pictures, the one that looks most as all do: people take most photographs
+ * of what they care for from its front.
+ */
+function amongFullest(poses: Pose[], counts: number[]): number {
+  const most = Math.max(...counts);
+  const mean = meanOf(poses.map(({ forward }) => forward));
+  const agreement = poses.map(({ forward }, i) => (counts[i]! >= AS_GOOD * most ? dot(forward, mean) : -Infinity));
+  return agreement.indexOf(Math.max(...agreement));
+}
+
+function meanOf(vectors: Vector[]): Vector {
+  return vectors.reduce((sum, vector) => add(sum, vector, 1 / vectors.length), [0, 0, 0] as Vector);
 }
 
 interface Lens {
@@ -56,11 +73,9 @@ function seen(positions: ArrayLike<number>, pose: Pose, { width, height, fx, fy 
 }
 
 function looksOutwards(poses: Pose[], extent: number): boolean {
-  const mean = (vectors: Vector[]): Vector =>
-    vectors.reduce((sum, vector) => add(sum, vector, 1 / vectors.length), [0, 0, 0] as Vector);
   if (poses.length < 3) return false;
-  if (Math.hypot(...mean(poses.map(({ forward }) => forward))) > ALL_SIDES) return false;
-  const middle = mean(poses.map(({ centre }) => centre));
+  if (Math.hypot(...meanOf(poses.map(({ forward }) => forward))) > ALL_SIDES) return false;
+  const middle = meanOf(poses.map(({ centre }) => centre));
   const offsets = poses.map(({ centre }) => add(centre, middle, -1));
   const spread = Math.max(...offsets.map((offset) => Math.hypot(...offset)));
   if (spread < ONE_PLACE * extent) return true;

@@ -35,6 +35,8 @@ NEARLY_ALL, MOST = 0.999, 0.95  # of the positions
 # To see nearly all of an object one need not stand much farther away than to see most of it. Measured: objects 1.1 to
 # 1.3 times, captures with their surroundings 2 times and more.
 OF_OBJECT = 1.6
+AS_GOOD = 0.8  # of the positions that the camera with most has in its picture: such others are as good
+EDGE = 0.02  # of the sides of a picture: what is nearer to its edge does not count
 LOOKS = 8  # cameras of a circle that are asked how much they show
 MOST_LOOKED_AT = 20_000  # positions
 
@@ -222,6 +224,25 @@ def whole(positions: np.ndarray, *, frames: int, width: int, height: int) -> lis
     """Cameras on a circle (`orbit`) that have an object whole in their pictures."""
     distance = distance_of_all(positions, width=width, height=height)
     return orbit(positions, frames=frames, width=width, height=height, distance=distance)
+
+
+def first_view(positions: np.ndarray, cameras: Sequence[Camera]) -> int:
+    """Number of the camera that a scene is shown from first, as in the web page.
+
+    Of the cameras with many of the positions [N, 3] in their pictures it is the one that looks most as all do: people
+    take most photographs of what they care for from its front.
+    """
+    step = max(1, len(positions) // MOST_LOOKED_AT)
+    seen = np.asarray(positions[::step], dtype=np.float64)
+    counts = []
+    for camera in cameras:
+        across, down, ahead = camera.rotation @ (seen - camera.center).T
+        before = ahead > 0
+        x, y = across[before] / ahead[before] * camera.fx, down[before] / ahead[before] * camera.fy
+        counts.append(int((np.maximum(abs(x) / camera.width, abs(y) / camera.height) < 0.5 - EDGE).sum()))
+    directions = np.stack([camera.rotation[2] for camera in cameras])
+    agreement = directions @ directions.mean(axis=0)
+    return int(np.argmax(np.where(np.array(counts) >= AS_GOOD * max(counts), agreement, -np.inf)))
 
 
 def _middle_and_radius(positions: np.ndarray) -> tuple[np.ndarray, float]:

@@ -37,7 +37,7 @@ class Thumbnails:
         return self._of(file).trouble
 
     def picture(self, file: Path) -> bytes | None:
-        """A JPEG of its first viewpoint; None for a file that cannot be decoded, whose trouble is then known."""
+        """A JPEG of what the page shows first; None for a file that cannot be decoded, whose trouble is then known."""
         known = self._of(file)
         with self._drawing:
             if known.picture is None and known.trouble is None:
@@ -73,14 +73,16 @@ def _found_wrong(file: Path) -> str | None:
 
 def _drawn(file: Path) -> bytes:
     """Raises BitstreamError."""
-    from compgs.evaluation.camera_path import whole
+    from compgs.evaluation.camera_path import first_view, whole
     from compgs.formats import open_scene
     from compgs.metrics import to_8bit
     from compgs.render import render
+    from compgs.render.render_model import local_camera
 
     model = open_scene(file)
     if model.viewpoints:
-        camera = model.viewpoints[0]
+        cameras = [local_camera(model, camera) for camera in model.viewpoints]
+        camera = model.viewpoints[first_view(model.bounds[0], cameras)]
         scale = max(WIDTH / camera.width, HEIGHT / camera.height)
         camera = camera.resized(*(max(1, round(side * scale)) for side in (camera.width, camera.height)))
     else:
