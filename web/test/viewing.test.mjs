@@ -54,7 +54,8 @@ test("a scene is opened from the viewpoint that has most of it in its picture", 
 
 test("of viewpoints that show as much, the one that looks as most do comes first", () => {
   const front = [-0.3, 0, 0.3].map((x) => looking([x, 0, -4], [0, 0, 0]));
-  const views = [looking([5, 0, 0], [0, 0, 0]), ...front, looking([0, 0, -0.5], [0, 0, 0])];
+  const aside = [-5, 5].map((x) => looking([x, 0, 0], [0, 0, 0]));
+  const views = [aside[0], ...front, looking([0, 0, -0.5], [0, 0, 0]), aside[1]];
   assert.equal(firstView(ball, { up: [0, -1, 0], views }, 1).view, 2);
 });
 
@@ -68,6 +69,10 @@ test("one looks around where the cameras did, and turns about what they surround
     true,
     "in one place",
   );
+  const far = ball.map((x) => 30 * x); // what stands behind something that was walked around
+  const around = circle(8, 4).map((place) => looking(place, [0, 0, 0]));
+  const inFront = [...ball.slice(0, 30), ...far];
+  assert.equal(firstView(inFront, { up: [0, -1, 0], views: around }, 30).isInside, false, "before a far background");
   const forward = circle(8, 1).map(([x, , z]) => looking([x, z, 0], [x, z, 9]));
   assert.equal(of(forward), false, "all look the same way");
 });

@@ -23,6 +23,9 @@ const OUTWARDS = 0.2;
 /** Of the scene's extent: cameras that stand closer together turn in one place. */
 const ONE_PLACE = 0.25;
 
+/** Of the anchors: what so many belong to, in the middle of the cameras, is what these were around. */
+const SURROUNDED = 0.05;
+
 /** `positions`: 3 numbers for each anchor. */
 export function firstView(
   positions: ArrayLike<number>,
@@ -32,7 +35,7 @@ export function firstView(
   if (!viewpoints) return { view: 0, isInside: false };
   const poses = viewpoints.views.map(({ position, rotation }) => Pose.of([...position] as Vector, rotation));
   const counts = viewpoints.views.map((lens, i) => seen(positions, poses[i]!, lens));
-  return { view: amongFullest(poses, counts), isInside: looksOutwards(poses, extent) };
+  return { view: amongFullest(poses, counts), isInside: looksOutwards(positions, poses, extent) };
 }
 
 /**
@@ -72,13 +75,24 @@ function seen(positions: ArrayLike<number>, pose: Pose, { width, height, fx, fy 
   return count;
 }
 
-function looksOutwards(poses: Pose[], extent: number): boolean {
+/** Something stands around a place: a part of all anchors is that near. */
+function isAround(positions: ArrayLike<number>, place: Vector, radius: number): boolean {
+  const stride = 3 * Math.max(1, Math.floor(positions.length / 3 / SAMPLES));
+  let [near, all] = [0, 0];
+  for (let at = 0; at + 2 < positions.length; at += stride) {
+    all++;
+    if (Math.hypot(...add([positions[at]!, positions[at + 1]!, positions[at + 2]!], place, -1)) < radius) near++;
+  }
+  return near > SURROUNDED * all;
+}
+
+function looksOutwards(positions: ArrayLike<number>, poses: Pose[], extent: number): boolean {
   if (poses.length < 3) return false;
   if (Math.hypot(...meanOf(poses.map(({ forward }) => forward))) > ALL_SIDES) return false;
   const middle = meanOf(poses.map(({ centre }) => centre));
   const offsets = poses.map(({ centre }) => add(centre, middle, -1));
   const spread = Math.max(...offsets.map((offset) => Math.hypot(...offset)));
-  if (spread < ONE_PLACE * extent) return true;
+  if (spread < ONE_PLACE * extent && !isAround(positions, middle, spread / 2)) return true;
   const cosines = poses.map(({ forward }, i) => dot(forward, unit(offsets[i]!)));
   return cosines.reduce((sum, cosine) => sum + cosine, 0) / cosines.length > OUTWARDS;
 }
