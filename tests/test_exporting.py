@@ -16,10 +16,14 @@ from compgs.codec.writer import write_content
 from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import surround
 from compgs.exporting import Exported, export, own_cameras, smaller
-from compgs.formats import encoded, open_scene, read_ply
+from compgs.formats import encoded, open_scene, read_ply, sog_streamed
 from compgs.formats.arrays import normalized
 from compgs.formats.ply import ply_size
+from compgs.formats.tiled import read_manifest
+from compgs.formats.tiled_writer import NewTile, write_tiles
+from compgs.metrics import psnr, to_8bit
 from compgs.model.splats import SplatArrays, SplatModel
+from compgs.ordering.order import canonical_order, level_counts
 from compgs.render import RasterSettings, render
 
 
@@ -304,3 +308,65 @@ def test_who_exports_a_scene_that_is_sharper_than_others_draw_it_is_told(
     for pixels, softer in ((0.3, False), (0.02, True)):
         file = with_dilation(tiny_cgs, pixels, tmp_path / f"{pixels}.cgs")
         assert export(file, tmp_path / f"{pixels}.ply", degree=0, refine=0).softer == softer
+
+
+def from_coarse_to_fine(tiny_cgs: Path, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bytes:
+    """A scene with two ranges, somewhere in the world."""
+    content = read_content(tiny_cgs.read_bytes())
+    counts = level_counts(content.coordinates[canonical_order(content.coordinates)])
+    half = next(level for level, count in enumerate(counts) if count >= 0.3 * counts[-1])
+    return write_content(replace(content, world_offset=offset), levels=[half, len(counts) - 1])
+
+
+def test_levels_of_a_file_are_its_beginnings_each_like_the_whole(tmp_path: Path, tiny_cgs: Path) -> None:
+    source = tmp_path / "scene.cgs"
+    source.write_bytes(from_coarse_to_fine(tiny_cgs))
+    counted: list[tuple[int, int]] = []
+    exported = compgs.export(
+        source,
+        tmp_path / "levels" / "lod-meta.json",
+        refine=5,
+        degree=1,
+        progress=lambda *done: counted.append(done),
+    )
+    path = tmp_path / "levels" / "lod-meta.json"
+    files = [file for file in path.parent.rglob("*") if file.is_file()]
+    assert exported.bytes == sum(file.stat().st_size for file in files)
+    finest, coarsest = sog_streamed.read_meta(path).counts
+    assert exported.splats == finest and 0 < coarsest <= 0.5 * finest
+    assert exported.degree == 1 == sog_streamed.read(path, 1).degree
+    assert min(exported.psnr) > 25
+    assert counted == [(1, 2), (2, 2)]
+    # Fitting to pictures of the whole makes the coarse level more like it than baking alone.
+    scene = open_scene(source)
+    values = []
+    for steps in (0, 40):
+        compgs.export(source, path, refine=steps, degree=1, overwrite=True, progress=False)
+        model = SplatModel(sog_streamed.read(path, 1), scene.background).at(scene.world_offset)
+        views = scene.viewpoints[:3]
+        values.append(
+            np.mean([psnr(*(to_8bit(render(m, view).image) for m in (scene, model))) for view in views])
+        )
+    assert values[1] > values[0]
+
+
+def test_tiles_become_levels_in_one_frame(tmp_path: Path, tiny_cgs: Path) -> None:
+    offsets = ((5.0, 0.0, 0.0), (9.0, 0.0, 0.0))
+    tiles = [NewTile(f"t{i}", from_coarse_to_fine(tiny_cgs, offset)) for i, offset in enumerate(offsets)]
+    manifest = write_tiles(tmp_path / "town.tiles", tiles)
+    path = tmp_path / "levels" / "lod-meta.json"
+    exported = compgs.export(tmp_path / "town.tiles", path, refine=0, degree=0, progress=False)
+    assert exported.origin == read_manifest(manifest).world_offset == (7.0, 0.0, 0.0)
+    assert sog_streamed.read_meta(path).levels == 2
+    assert min(exported.psnr) > 20
+    splats = sog_streamed.read(path)
+    one = open_scene(tmp_path / "town.tiles" / "t0.cgs")
+    middle = np.median(one.bounds[0], axis=0) + one.world_offset - (7.0, 0.0, 0.0)
+    assert (np.abs(np.median(splats.means[splats.means[:, 0] < middle[0] + 2], axis=0) - middle) < 1).all()
+
+
+@pytest.mark.parametrize("limit", ["max_splats", "max_bytes"])
+def test_levels_are_not_thinned(limit: str, tmp_path: Path, tiny_cgs: Path) -> None:
+    with pytest.raises(ConfigError, match=f"{limit} = 100: .* viewers choose"):
+        compgs.export(tiny_cgs, tmp_path / "lod-meta.json", **{limit: 100})
+    assert not list(tmp_path.glob("*_*"))

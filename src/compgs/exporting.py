@@ -21,7 +21,18 @@ from compgs.devices import chosen_device
 from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError, SplatFileError
 from compgs.evaluation.camera_path import between, surround
 from compgs.evaluation.importance import splat_importance
-from compgs.formats import WRITERS, SplatArrays, format_of, open_scene, scene_file, spz, told
+from compgs.formats import (
+    WRITERS,
+    SplatArrays,
+    format_of,
+    levels,
+    open_scene,
+    scene_file,
+    sog_streamed,
+    sog_streamed_writer,
+    spz,
+    told,
+)
 from compgs.formats.baking import Baked, bake
 from compgs.formats.refining import refine as refine_splats
 from compgs.formats.registry import KEEP_WORLD_OFFSET
@@ -49,6 +60,7 @@ VIEWED_CAMERAS = 6  # that are compared at this size
 SOFTER = 0.5  # of what other programs dilate splats by; who has less is sharper to the eye
 LEAST_DEGREE = 1  # of harmonics, before splats are left out for a file to be small enough
 MOST_STEPS = 100_000  # of refining
+MOST_COMPARED = 2_000_000  # splats of a scene of levels that is read again as a whole
 BUDGET_MARGIN = 0.995  # of the size aimed at: sizes are not quite proportional to the number of splats
 
 
@@ -97,7 +109,7 @@ def export(
     progress: Callable[[int, int], None] | Literal[False] | None = None,
 ) -> Exported:
     """Write a scene, or the one in a file, as `.ply`, `.spz`, `.sog` or `.glb`, or as a web page (`.html`), by what the
-    path ends in.
+    path ends in; as `lod-meta.json`, a streamed .sog of several levels of detail, with its parts in folders beside it.
 
     Of a .cgs file opacity and color are baked to harmonics of `degree` over the cameras that the file holds and more
     between them. Of files of splats, harmonics above `degree` are left out. With `max_splats` or `max_bytes` those
@@ -117,13 +129,20 @@ def export(
     if spz_version not in spz.WRITTEN_VERSIONS:
         raise ConfigError(f"spz_version = {spz_version}: expected one of {spz.WRITTEN_VERSIONS}")
     kind = path.suffix.lower().removeprefix(".")
-    if kind not in (*WRITERS, HTML):
+    is_streamed = path.name == sog_streamed.NAME
+    if kind not in (*WRITERS, HTML) and not is_streamed:
         kinds = ", ".join(f".{name}" for name in (*WRITERS, HTML))
-        raise OutputError(f"{path}: expected a name that ends in {kinds}")
+        raise OutputError(f"{path}: expected a name that ends in {kinds}, or {sog_streamed.NAME}")
     check_output_file(path, overwrite=overwrite)
     if kind == HTML:
         limits.check_none(path)
         return _export_page(as_path(source, "source"), path)
+    if is_streamed:
+        limits.check_whole(path)
+        most = MAX_DEGREE if degree is None else degree
+        return _export_levels(
+            as_path(source, "source"), path, most, refine, chosen_device(device), progress or None
+        )
     write = functools.partial(spz.encoded, version=spz_version) if kind == "spz" else WRITERS[kind]
     chosen = chosen_device(device)
     model = _opened(source, chosen, level)
@@ -138,7 +157,7 @@ def export(
             "can be rendered, compared and evaluated as it is"
         )
     cameras = own_cameras(model)
-    fitted = [smaller(c) for c in (*cameras, *between(cameras, max(0, FITTED_CAMERAS - len(cameras))))]
+    fitted = _fitted(cameras)
     compared = (*cameras, *between(cameras, COMPARED_CAMERAS, seed=1))
     viewed = viewing_cameras(compared)
     changed = limits.change(model)
@@ -201,6 +220,15 @@ class Limits:
                 raise ConfigError(
                     f"{name} = {value}: {path} will hold the .cgs file as it is, no splats; leave it out, or make the "
                     "file smaller first (compgs encode --drop)"
+                )
+
+    def check_whole(self, path: Path) -> None:
+        """Raises ConfigError if splats should be left out, of a scene of levels."""
+        for name, value in (("max_splats", self.most_splats), ("max_bytes", self.most_bytes)):
+            if value is not None:
+                raise ConfigError(
+                    f"{name} = {value}: {path} holds the scene at every level of detail, viewers choose; "
+                    "leave it out"
                 )
 
     def change(self, model: Renderable) -> bool:
@@ -279,7 +307,7 @@ def own_cameras(model: Renderable) -> list[Camera]:
     """Return cameras of the world: those that the scene was captured with, where its file names more than one; else all
     around.
     """
-    if isinstance(model, HybridModel) and len(model.viewpoints) > 1:
+    if isinstance(model, HybridModel | TiledScene) and len(model.viewpoints) > 1:
         return list(model.viewpoints)
     around = surround(model.bounds[0])
     return [camera.moved(tuple(-x for x in model.world_offset)) for _, camera in around]
@@ -375,6 +403,60 @@ def _opened(source: "str | Path | Renderable | Trained", device: str, level: int
     if isinstance(source, Renderable):
         return source
     return open_scene(as_path(source, "source"), device, level=level)
+
+
+def _export_levels(
+    source: Path,
+    path: Path,
+    degree: int,
+    refine: int,
+    device: str,
+    progress: Callable[[int, int], None] | None,
+) -> Exported:
+    """A lod-meta.json and its parts. Raises as `export` does."""
+    source = scene_file(source)
+    found = format_of(source)
+    found.check(source)
+    baked = 0
+
+    def bake_level(model: HybridModel, whole: HybridModel) -> SplatArrays:
+        nonlocal baked
+        cameras = own_cameras(whole)
+        fitted = _fitted(cameras)
+        level = bake(model, fitted, degree)
+        splats = refine_splats(level, whole, fitted, refine, settings=as_others_draw(whole, cameras)).splats
+        baked += 1
+        if progress:
+            progress(baked, total)
+        return splats
+
+    total = levels.levels_in(source)
+    model = open_scene(source, device)
+    if found.name == "cgs":
+        levels.export_file(source, path, device, bake_level)
+    elif found.name == "tiles":
+        levels.export_tiles(source, path, device, bake_level)
+    elif isinstance(model, SplatModel):
+        sog_streamed_writer.write_levels(path, 1, iter([[model.splats.of_degree(degree)]]))
+    else:
+        raise SplatFileError(
+            f"{source}: its splats are made anew for each camera; no level of them can be written"
+        )
+    files = [path, *(file for part in sog_streamed.parts(path) for file in part.parent.iterdir())]
+    splats = sog_streamed.read_meta(path).counts[0]
+    psnr: tuple[float, ...] = ()
+    if splats <= MOST_COMPARED:
+        again = SplatModel(sog_streamed.read(path), model.background).at(model.world_offset)
+        psnr = tuple(
+            _compared(model, again, between(own_cameras(model), COMPARED_CAMERAS, seed=1), lambda: None)
+        )
+    return Exported(sum(file.stat().st_size for file in files), splats, degree, 0, psnr, model.world_offset)
+
+
+def _fitted(cameras: Sequence[Camera]) -> list[Camera]:
+    """Cameras to bake through: a scene's own, and more between them."""
+    more = between(cameras, max(0, FITTED_CAMERAS - len(cameras)))
+    return [smaller(camera) for camera in (*cameras, *more)]
 
 
 def _export_page(source: Path, path: Path) -> Exported:

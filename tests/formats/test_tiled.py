@@ -12,19 +12,20 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.codec.decoder import decode_bytes
-from compgs.codec.reader import read_content
+from compgs.codec.reader import file_info, read_content
 from compgs.codec.reduce import without_coupled
 from compgs.codec.writer import write_content
 from compgs.devices import drawn
 from compgs.errors import BitstreamError, ConfigError, CorruptSection, NotACompGSFile, UnsupportedVersion
 from compgs.evaluation.camera_path import look_at, orbit
 from compgs.formats import check_scene, component_bytes, format_of, open_scene, open_tiles
+from compgs.formats.tile_detail import levels_with_whole, wanted_levels
 from compgs.formats.tiled import Core, GroundAxes, read_manifest
 from compgs.formats.tiled_scene import ASKED_BY, TileCache, TiledScene, resident_bytes, tile_memory
 from compgs.formats.tiled_writer import NewTile, _counted_from, common_offset, spheres, write_tiles
 from compgs.gaussians import Gaussians
 from compgs.ordering.order import canonical_order, level_counts
-from compgs.render import RasterSettings, Renderable, rasterize, render, settings_of
+from compgs.render import RasterSettings, Renderable, local_camera, rasterize, render, settings_of
 
 APART = 8.0  # world units between the middles of two tiles
 DILATION = 2.0**-12  # at cameras of 60 pixels: three times what is added without one
@@ -261,6 +262,55 @@ def test_a_manifest_from_before_tiles_had_levels_is_read(copy: Path) -> None:
 def test_the_frame_of_tiles_with_one_offset_is_theirs() -> None:
     assert common_offset([(1.5, 2.0, 3.0)] * 2) == (1.5, 2.0, 3.0)
     assert common_offset([(0.0, 0.0, 0.0), (1.0, 2.0, 3.3)]) == (0.0, 1.0, 2.0)
+
+
+# detail ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def row(contents: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six tiles one behind the other along y, each from coarse to fine."""
+    place = tmp_path_factory.mktemp("scenes") / "row.tiles"
+    content = read_content(from_coarse_to_fine(contents[0]))
+    levels = [part.level for part in file_info(from_coarse_to_fine(contents[0])).ranges]
+    offsets = [(0.0, i * APART, 0.0) for i in range(6)]
+    tiles = [write_content(replace(content, world_offset=offset), levels=levels) for offset in offsets]
+    return write_tiles(place, [NewTile(str(i), data) for i, data in enumerate(tiles)])
+
+
+def before_the_row(width: int = 64) -> Camera:
+    pose = look_at(np.array([0.0, -APART, 2.0]), np.array([0.0, 2 * APART, 0.0]), np.array([0.0, 0, 1]))
+    return Camera(pose, 0.9 * width, 0.9 * width, width / 2, width / 2, width, width)
+
+
+def test_with_a_cap_near_tiles_are_finer_than_far_ones_and_no_picture_has_more(row: Path) -> None:
+    tiles = read_manifest(row).tiles
+    camera = before_the_row(800)
+    one = tiles[0].coupled_primitives
+    for most in (one // 3, one, 2 * one, 4 * one):
+        model = open_tiles(row, most_splats=most)
+        local = local_camera(model, camera)
+        wanted = wanted_levels(tiles, local, most)
+        counts = [
+            levels_with_whole(t)[n - 1].coupled_primitives if n else 0
+            for t, n in zip(tiles, wanted, strict=True)
+        ]
+        assert 0.5 * most < sum(counts) <= most
+        assert wanted == sorted(wanted, reverse=True) and wanted[0] > wanted[-1]
+        drawn = render(model, camera)
+        assert drawn.visible.sum() <= most
+        assert drawn.image.std() > 0.01
+        assert all(len(part.means) <= most for part in model.parts(local))
+
+
+def test_a_cap_with_room_for_all_that_is_seen_changes_nothing(row: Path) -> None:
+    camera = before_the_row(800)
+    capped = open_tiles(row, most_splats=10**9)
+    np.testing.assert_array_equal(render(capped, camera).image, render(open_tiles(row), camera).image)
+    # Seen small, coarse tiles are enough.
+    small = before_the_row(16)
+    few = sum(len(part.means) for part in capped.parts(local_camera(capped, small)))
+    assert few < 0.5 * sum(len(part.means) for part in open_tiles(row).parts(local_camera(capped, small)))
 
 
 # damage ------------------------------------------------------------------------------------------------------------

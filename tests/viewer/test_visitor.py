@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 
 import compgs
+from compgs.codec.reader import file_info
 from compgs.errors import CorruptSection
+from compgs.formats import SplatArrays
+from compgs.formats.sog_streamed_writer import write_levels
+from compgs.formats.tiled_writer import NewTile, write_tiles
 from compgs.metrics import psnr, to_8bit
 from compgs.render import RasterSettings
 from compgs.viewer.pace import Pace
@@ -128,6 +132,39 @@ def test_the_levels_are_the_beginnings_of_the_file_that_are_scenes(shown: FileSh
     levels = FileShown(GOLDEN, "cpu").levels
     assert levels == ("11.8 kB: 214 anchors", "13.0 kB: 437 anchors", "all of it: 14.9 kB")
     assert len(shown.levels) == 1 and shown.levels[0].startswith("all of it: ")
+
+
+def test_with_a_cap_a_file_is_its_longest_beginning_within_it() -> None:
+    parts = file_info(GOLDEN.read_bytes()).ranges
+    for most, expected in (
+        (parts[-1].coupled, parts[-1]),
+        (parts[-1].coupled - 1, parts[-2]),
+        (parts[1].coupled, parts[1]),
+        (1, parts[0]),  # the coarsest is shown even so
+    ):
+        shown = FileShown(GOLDEN, "cpu", most=most)
+        finest = shown.model(len(shown.levels) - 1)
+        assert finest.counts == {"anchors": expected.anchors, "coupled_primitives": expected.coupled}
+        assert len(shown.levels) == parts.index(expected) + 1
+
+
+def splats(count: int) -> SplatArrays:
+    """In one place, gray."""
+    zeros, rows = np.zeros((count, 3), np.float32), np.zeros((count, 0, 3), np.float32)
+    turned = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+    return SplatArrays(zeros, zeros, turned, np.zeros(count, np.float32), zeros, rows)
+
+
+def test_with_a_cap_tiles_and_levels_of_a_streamed_sog_are_within_it(tmp_path: Path) -> None:
+    tiles = write_tiles(tmp_path / "town.tiles", [NewTile("a", GOLDEN.read_bytes())])
+    parts = file_info(GOLDEN.read_bytes()).ranges
+    shown = FileShown(tiles, "cpu", most=parts[0].coupled)
+    picture = compgs.render(shown.model(0), shown.cameras[0][1])
+    assert 0 < picture.visible.sum() <= parts[0].coupled
+    write_levels(tmp_path / "lod-meta.json", 2, iter([[splats(60), splats(20)]]))
+    for most, level in ((60, 60), (59, 20), (5, 20)):
+        shown = FileShown(tmp_path / "lod-meta.json", "cpu", most=most)
+        assert shown.model(0).counts == {"splats": level}
 
 
 def test_a_part_that_cannot_be_decoded_is_said_once_and_the_rest_goes_on(

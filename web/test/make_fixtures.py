@@ -38,6 +38,8 @@ from compgs.codec.reader import file_info, read_latents  # noqa: E402
 from compgs.codec.viewpoints import Viewpoint, Viewpoints  # noqa: E402
 from compgs.codec.writer import write_content  # noqa: E402
 from compgs.errors import BitstreamError  # noqa: E402
+from compgs.formats.tile_detail import wanted_levels  # noqa: E402
+from compgs.formats.tiled import read_manifest  # noqa: E402
 from compgs.formats.tiled_writer import NewTile, write_tiles  # noqa: E402
 from compgs.ordering.order import canonical_order, level_counts  # noqa: E402
 
@@ -271,14 +273,29 @@ def _written(content: FileContent, levels: list[int] | None) -> bytes:
 
 
 def city(folder: Path) -> None:
-    """SIDE x SIDE tiles side by side along x and z, each from coarse to fine."""
+    """SIDE x SIDE tiles side by side along x and z, each from coarse to fine; and how many levels of each the package
+    draws for some cameras that see all of them.
+    """
     content = _with_heads(make_content(900, 19, make_dimensions(5, paper_groups(12, 0))))
     pitch = float(np.ptp(content.coordinates, axis=0).max()) * content.voxel_size
     tiles = []
     for i, j in itertools.product(range(SIDE), repeat=2):
         placed = replace(content, world_offset=(i * pitch, 0.0, j * pitch))
         tiles.append(NewTile(f"{i}_{j}", _written(placed, EVERY_LEVEL)))
-    write_tiles(folder, tiles)
+    manifest = read_manifest(write_tiles(folder, tiles))
+    middle = np.mean([sphere[:3] for tile in manifest.tiles for sphere in tile.spheres], axis=0)
+    cases = []
+    for height, most in itertools.product((5, 9, 40, 200), (2_000, 9_000, 10**9)):
+        rotation = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # straight down
+        pose = np.eye(4)
+        pose[:3, :3] = rotation
+        pose[:3, 3] = -rotation @ (middle - np.array((0, height * pitch, 0)))
+        camera = Camera(pose, 500, 500, 640, 400, 1280, 800)
+        lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy")}
+        sight = lens | {"centre": camera.center.tolist(), "rotation": rotation.ravel().tolist()}
+        levels = wanted_levels(manifest.tiles, camera, most)
+        cases.append({"sight": sight, "most": most, "levels": levels})
+    (folder / "wanted.json").write_text(json.dumps(cases))
 
 
 def main() -> None:

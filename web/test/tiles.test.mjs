@@ -132,6 +132,13 @@ test("of tiles alike, the nearest in view comes first, and the farther the fewer
   for (let i = 1; i < steps.length; i++) assert.ok(steps[i].coarseness <= steps[i - 1].coarseness);
 });
 
+test("tiles have the levels that the package draws", { skip }, () => {
+  const cases = JSON.parse(readFileSync(join(CITY, "wanted.json"), "utf8"));
+  for (const { sight, most, levels } of cases)
+    assert.deepEqual([...planDetail(manifest.tiles, sizes(), sight, most, nothing()).levels], levels);
+  assert.ok(new Set(cases.map(({ levels }) => levels.join())).size > 5);
+});
+
 test("what is behind the camera comes after what is as near before it", { skip }, () => {
   const [x, z] = placeOf("2_2");
   const look = (towards) => {

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Export(DecodingCommand, SceneFileArgument, LevelOption):
-    """Write a scene as plain splats (.ply, .spz, .sog, .glb), or as a web page that shows it (.html).
+    """Write a scene as plain splats (.ply, .spz, .sog, .glb), with levels of detail (lod-meta.json), or as a web page
+    that shows it (.html).
 
     In a .cgs file opacity and color depend on where one stands; other programs know harmonics. They are fitted
     over the cameras that the file holds, and what that costs is measured: the new file is read again and its
@@ -35,6 +36,8 @@ class Export(DecodingCommand, SceneFileArgument, LevelOption):
     compgs export garden.ply garden.glb
 
     compgs export city/lod-meta.json city.ply --level 2
+
+    compgs export garden.cgs garden/lod-meta.json
     """
 
     output: Annotated[Positional[Path], arg(metavar="OUT")]
@@ -95,7 +98,9 @@ def report(source: Path, path: Path, exported: "Exported") -> list[str]:
         return [f"{path}: {size(exported.bytes)}, a page that shows {source.name} without anything else"]
     splats = f"{exported.splats:,} splats of degree {exported.degree}"
     lines = [f"{path}: {size(exported.bytes)} ({exported.bytes:,} bytes), {splats}"]
-    if exported.worst == float("inf"):
+    if not exported.psnr:
+        lines.append("too many to be compared with the scene here")
+    elif exported.worst == float("inf"):
         lines.append(f"its pictures are those of {source.name}, from {len(exported.psnr)} cameras")
     else:
         lines.append(

@@ -12,8 +12,10 @@ from compgs.cli.command import NO_DEFAULT, DecodingCommand, MemoryOption, SceneF
 from compgs.cli.console import say
 from compgs.cli.levels import LevelOption
 from compgs.cli.run_folder import file_and_run
-from compgs.cli.usage import UsageError
+from compgs.cli.usage import UsageError, check_range
 from compgs.cli.viewing import check_viewing, listening
+
+MOST_SPLATS = 1_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,10 @@ class View(DecodingCommand, SceneFileOrRunArgument, LevelOption, MemoryOption):
     ] = None
     """Color behind everything, 0 to 1, to begin with; by default the file's own, or black."""
 
+    max_splats: Annotated[int, arg(metavar="N")] = 3_000_000
+    """That a picture may have. Of tiles, what is near is then finer than what is far; of a .cgs file its finest parts
+    are left out, of a lod-meta.json its finest levels."""
+
     def run(self) -> None:
         self.check_values()
         from compgs.formats import check_scene
@@ -63,7 +69,7 @@ class View(DecodingCommand, SceneFileOrRunArgument, LevelOption, MemoryOption):
         from compgs.viewer.shown import FileShown
         from compgs.viewer.stage import OwnThread
 
-        shown = FileShown(file, chosen_device(self.device), self.background, self.level)
+        shown = FileShown(file, chosen_device(self.device), self.background, self.level, self.max_splats)
         with listening(shown, OwnThread(self.prepare), self.host, self.port) as viewer:
             say(f"{file}: {viewer.address}")
             if self.open:
@@ -75,5 +81,6 @@ class View(DecodingCommand, SceneFileOrRunArgument, LevelOption, MemoryOption):
     def check_values(self) -> None:
         """Raises UsageError, MissingDependency."""
         check_viewing(self.port)
+        check_range("--max-splats", self.max_splats, 1, MOST_SPLATS)
         if self.background is not None and not all(0 <= part <= 1 for part in self.background):
             raise UsageError(f"--background {self.background}: expected three numbers from 0 to 1")

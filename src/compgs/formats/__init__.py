@@ -7,7 +7,7 @@
 | .compressed.ply, SuperSplat | yes | no | 16 to 61 |
 | .spz 1 to 4 | yes | 3, 4 | 65 before packing |
 | .sog 1, 2, zip or meta.json | yes | 2 | about 25 |
-| lod-meta.json, .sog of several levels | yes | no | |
+| lod-meta.json, .sog of several levels | yes | by `compgs.export` | as .sog, each level |
 | .glb, .gltf, KHR_gaussian_splatting | yes | .glb | 240 |
 | .ksplat, GaussianSplats3D | yes | no | 24 to 140, degree 2 at most |
 | .splat | yes | no | 32, no harmonics |

@@ -81,7 +81,7 @@ _NO_TIME = (1980, 1, 1, 0, 0, 0)
 def encoded(arrays: SplatArrays) -> bytes:
     """The content of a zip. Splats come in an order in which neighbours are near, for the images to compress."""
     arrays = arrays.rows(morton_order(arrays.means))
-    files, meta = _images(arrays)
+    files, meta = images(arrays)
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name, content in {META: json.dumps(meta).encode(), **files}.items():
@@ -89,8 +89,8 @@ def encoded(arrays: SplatArrays) -> bytes:
     return buffer.getvalue()
 
 
-def _images(arrays: SplatArrays) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Files by name, and what meta.json says."""
+def images(arrays: SplatArrays) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Files by name, and what meta.json says; splats stay in their order."""
     logs = np.sign(arrays.means) * np.log1p(np.abs(arrays.means.astype(np.float64)))
     low, high = logs.min(0), logs.max(0)
     steps = np.rint(65535 * (logs - low) / np.where(high > low, high - low, 1)).astype(np.uint16)

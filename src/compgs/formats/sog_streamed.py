@@ -1,4 +1,6 @@
-"""Scenes of many .sog files at several levels of detail (PlayCanvas's streamed SOG): `lod-meta.json`. Only read here.
+"""Scenes of many .sog files at several levels of detail (PlayCanvas's streamed SOG): `lod-meta.json`.
+
+`sog_streamed_writer` writes them.
 
 | field | what |
 |---|---|
@@ -103,6 +105,13 @@ def _tell_of_disagreement(path: Path, says_antialiased: dict[str, bool]) -> None
         one, other = ("antialiased", "not antialiased") if drawn else ("not antialiased", "antialiased")
         named = others[0] if len(others) == 1 else f"{others[0]} and {len(others) - 1} more parts"
         note(path, f"{first} is {one}, {named} {other}: all of them are drawn {one}, as the first part says")
+
+
+def parts(path: Path) -> list[Path]:
+    """The meta.json, or .sog file, of each part of every level. Raises SplatFileError for one that is not there."""
+    scene = read_meta(path)
+    names = {name for level in range(scene.levels) for name in _parts(scene, level)}
+    return [_part(scene, name) for name in sorted(names)]
 
 
 def component_bytes(path: Path, level: int = FINEST) -> dict[str, int]:

@@ -204,12 +204,14 @@ def open_tiles(
     device: "Device" = "cpu",
     *,
     memory: int | None = None,  # bytes of open tiles; None: `compgs.formats.tiled_scene.tile_memory`
+    most_splats: int
+    | None = None,  # of a picture: tiles are as fine as there is room for. None: all there are
 ) -> "TiledScene":
     """A scene of tiles that are opened when a camera sees them. Raises BitstreamError, ConfigError."""
     from compgs.formats.tiled_scene import TiledScene
 
     check(path)
-    return TiledScene.of(path.parent, read_manifest(path), str(device), memory)
+    return TiledScene.of(path.parent, read_manifest(path), str(device), memory, most_splats)
 
 
 # to and from JSON --------------------------------------------------------------------------------------------------

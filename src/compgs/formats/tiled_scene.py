@@ -19,6 +19,7 @@ from compgs.cameras import Camera
 from compgs.codec.decoder import decode_bytes
 from compgs.devices import CPU, check_device, drawn
 from compgs.errors import ConfigError, CorruptSection
+from compgs.formats.tile_detail import levels_with_whole, wanted_levels
 from compgs.formats.tiled import COPY, Manifest, Vector, tile_bytes
 from compgs.gaussians import Gaussians
 from compgs.model.hybrid_model import HybridModel
@@ -106,25 +107,68 @@ class TileCache:
 
 
 @dataclass(frozen=True, eq=False)
+class Pieces:
+    """What can be opened: every tile as a whole, under its own number, then their coarser levels."""
+
+    places: Sequence[tuple[int, int]]  # the tile, and how many of its levels
+    coupled: Sequence[int]  # coupled primitives
+    memory: Sequence[int]  # bytes that are expected
+    first: Sequence[int]  # of each tile: where its coarser levels are
+
+    @classmethod
+    def of(cls, manifest: Manifest) -> "Pieces":
+        tiles = manifest.tiles
+        places = [(index, len(tile.levels) + 1) for index, tile in enumerate(tiles)]
+        first = []
+        for index, tile in enumerate(tiles):
+            first.append(len(places))
+            places += [(index, number) for number in range(1, len(tile.levels) + 1)]
+        coupled = [levels_with_whole(tiles[i])[number - 1].coupled_primitives for i, number in places]
+        # A level takes its share of the tile, roughly; room is made once more when it is there.
+        memory = [
+            max(1, tiles[i].memory * count // tiles[i].coupled_primitives)
+            for (i, _), count in zip(places, coupled, strict=True)
+        ]
+        return cls(places, coupled, memory, first)
+
+    def of_tile(self, index: int, number: int) -> int:
+        """The piece with so many levels of a tile."""
+        return index if number == self.places[index][1] else self.first[index] + number - 1
+
+
+@dataclass(frozen=True, eq=False)
 class TiledScene:
     """A folder of tiles; the units of `bounds` are groups of neighbouring anchors of a tile (`Renderable`)."""
 
     manifest: Manifest
     device: str
     background: Vector  # RGB, 0 to 1
-    cache: TileCache
+    cache: TileCache  # of `pieces`
+    pieces: "Pieces"
+    most_splats: int | None = (
+        None  # of a picture; tiles are then as fine as there is room for. None: all there are
+    )
 
     @classmethod
     def of(
-        cls, folder: Path, manifest: Manifest, device: str = CPU, memory: int | None = None
+        cls,
+        folder: Path,
+        manifest: Manifest,
+        device: str = CPU,
+        memory: int | None = None,
+        most_splats: int | None = None,
     ) -> "TiledScene":
         """Raises ConfigError for a device or an amount of memory that cannot be."""
         check_device(device)
+        pieces = Pieces.of(manifest)
 
-        def read(index: int) -> HybridModel:
+        def read(piece: int) -> HybridModel:
+            index, number = pieces.places[piece]
             tile = manifest.tiles[index]
-            model = decode_bytes(tile_bytes(folder, tile), folder / tile.file, device)
-            promised = tile.anchors, tile.coupled_primitives, tile.world_offset
+            level = levels_with_whole(tile)[number - 1]
+            data, is_whole = tile_bytes(folder, tile), number > len(tile.levels)
+            model = decode_bytes(data[: level.bytes], folder / tile.file, device, prefix=not is_whole)
+            promised = level.anchors, level.coupled_primitives, tile.world_offset
             if (model.anchors, model.coupled, model.world_offset) != promised:
                 raise CorruptSection(
                     f"{folder / tile.file}: holds another scene than the manifest says; {COPY}"
@@ -132,8 +176,8 @@ class TiledScene:
             return model
 
         most = tile_memory() if memory is None else memory
-        cache = TileCache(read, [tile.memory for tile in manifest.tiles], most)
-        return cls(manifest, device, manifest.background, cache)
+        cache = TileCache(read, pieces.memory, most)
+        return cls(manifest, device, manifest.background, cache, pieces, most_splats)
 
     @property
     def world_offset(self) -> Vector:
@@ -203,10 +247,11 @@ class TiledScene:
     def draw(self, camera: Camera, settings: RasterSettings) -> RasterResult[np.ndarray]:
         """What a camera of the scene's frame sees; room is made for what the tiles in view hold, not for all."""
         tiles = self.tiles_of(visible_mask(*self.bounds, camera, settings))
-        parts = self._seen(tiles, camera, settings)
+        pieces = self._chosen(tiles, camera)
+        parts = self._seen_of(pieces, camera, settings)
         if self.device != CPU:
             return drawn(_joined(parts), camera, settings, self.device)
-        most = sum(self.manifest.tiles[index].coupled_primitives for index in tiles)
+        most = sum(self.pieces.coupled[piece] for piece in pieces)
         return rasterize_parts(parts, most, camera, settings)
 
     def blended(self, gaussians: Gaussians[np.ndarray], camera: Camera, settings: RasterSettings) -> Blended:
@@ -217,17 +262,31 @@ class TiledScene:
         assert isinstance(tile, DrawsItself)
         return tile.blended(gaussians, camera, settings)
 
+    def _chosen(self, tiles: Sequence[int], camera: Camera) -> list[int]:
+        """Pieces to draw of tiles in view, in the order of the tiles."""
+        if self.most_splats is None:
+            return list(tiles)
+        entries = [self.manifest.tiles[index] for index in tiles]
+        wanted = wanted_levels(entries, camera, self.most_splats)
+        return [self.pieces.of_tile(index, n) for index, n in zip(tiles, wanted, strict=True) if n]
+
     def _seen(
         self, tiles: Sequence[int], camera: Camera, settings: RasterSettings
     ) -> Iterator[Gaussians[np.ndarray]]:
         """What a camera sees of some tiles, in the scene's frame; one part at least."""
-        if not tiles:
+        return self._seen_of(self._chosen(tiles, camera), camera, settings)
+
+    def _seen_of(
+        self, pieces: Sequence[int], camera: Camera, settings: RasterSettings
+    ) -> Iterator[Gaussians[np.ndarray]]:
+        if not pieces:
             yield _nothing()
-        wanted = frozenset(tiles)
-        for index in tiles:
+        wanted = frozenset(pieces)
+        for piece in pieces:
+            index = self.pieces.places[piece][0]
             shift = np.subtract(self.manifest.tiles[index].world_offset, self.world_offset)
             local = camera.moved(shift)
-            model = self.cache.get(index, wanted)
+            model = self.cache.get(piece, wanted)
             for part in model.parts(local, visible_mask(*model.bounds, local, settings)):
                 yield _moved(part, shift)
             del model  # or it would stay beside the next one, whatever the cache says

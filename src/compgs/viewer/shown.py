@@ -8,8 +8,19 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from compgs.cameras import Camera
+from compgs.codec import decode
+from compgs.codec.reader import file_info
 from compgs.evaluation.camera_path import whole
-from compgs.formats import component_bytes, format_of, open_scene, scene_file, scene_name
+from compgs.formats import (
+    component_bytes,
+    format_of,
+    open_scene,
+    open_tiles,
+    scene_file,
+    scene_name,
+    sog_streamed,
+)
+from compgs.formats.registry import HEAD_BYTES
 from compgs.render import Renderable
 from compgs.words import size
 
@@ -61,22 +72,37 @@ class Shown(Protocol):
 
 
 class FileShown:
-    """A file, or a beginning of it. Raises BitstreamError, SplatFileError."""
+    """A file, or a beginning of it. Raises BitstreamError, SplatFileError.
+
+    `most`: primitives that a picture may have. Tiles are then as fine as there is room for; a .cgs file is its longest
+    beginning that is not more, a lod-meta.json its finest level. Splats without levels are all shown.
+    """
 
     def __init__(
-        self, path: Path, device: str, background: Vector | None = None, level: int | None = None
+        self,
+        path: Path,
+        device: str,
+        background: Vector | None = None,
+        level: int | None = None,
+        most: int | None = None,
     ) -> None:
         path = self.path = scene_file(path)
         self.device = device
-        self.whole = open_scene(path, device, background or (0.0, 0.0, 0.0), level)
+        prefixes, everything = _beginnings(path, most)
+        if level is None and most is not None:
+            level = _level_within(path, most)
+        if format_of(path).name == "tiles":
+            self.whole: Renderable = open_tiles(path, device, most_splats=most)
+        elif everything is not None:
+            self.whole = decode(path, device, prefix=everything)
+        else:
+            self.whole = open_scene(path, device, background or (0.0, 0.0, 0.0), level)
         self.background = background or self.whole.background
         self.world_offset = self.whole.world_offset
         self.up: Vector = getattr(self.whole, "up", USUAL_UP)
         self.title = scene_name(path)
-        self._prefixes = _prefixes(path)
-        whole = size(sum(component_bytes(path).values()))
-        everything = f"all of it: {whole}" if level is None else f"level {level}"
-        self.levels = (*(words for _, words in self._prefixes), everything)
+        self._prefixes = prefixes
+        self.levels = (*(words for _, words in prefixes), _all_of(path, level, everything))
         cameras = self.whole.viewpoints
         self.cameras = tuple((f"camera {i}", camera) for i, camera in enumerate(cameras)) or (
             ("circle", _beside(self.whole)),
@@ -89,8 +115,6 @@ class FileShown:
 
     @functools.lru_cache(maxsize=KEPT_LEVELS)  # noqa: B019  # one file is shown as long as the process lives
     def _beginning(self, level: int) -> Renderable:
-        from compgs.codec import decode
-
         return decode(self.path, self.device, prefix=self._prefixes[level][0])
 
 
@@ -132,14 +156,38 @@ class GrowingShown:
         return self._snapshot
 
 
-def _prefixes(path: Path) -> list[tuple[int, str]]:
-    """Bytes of a file's beginnings that are scenes, and what to call them; without the whole file."""
+def _beginnings(path: Path, most: int | None) -> tuple[list[tuple[int, str]], int | None]:
+    """Bytes of a file's beginnings that are coarser scenes, and what to call them; and of the finest one that has at
+    most so many primitives, None if that is the whole file.
+    """
     if format_of(path).name != "cgs":
-        return []
-    from compgs.codec.reader import file_info
-
+        return [], None
     ranges = file_info(path.read_bytes()).ranges
-    return [(part.bytes, f"{size(part.bytes)}: {part.anchors:,} anchors") for part in ranges[:-1]]
+    fitting = [part for part in ranges if most is None or part.coupled <= most] or [ranges[0]]
+    words = [(part.bytes, f"{size(part.bytes)}: {part.anchors:,} anchors") for part in fitting[:-1]]
+    return words, None if fitting[-1] is ranges[-1] else fitting[-1].bytes
+
+
+def _level_within(path: Path, most: int) -> int | None:
+    """The finest level of a lod-meta.json with at most so many splats, else its coarsest; None: the finest there is, or
+    another file.
+    """
+    with open(path, "rb") as file:
+        if not sog_streamed.begins(file.read(HEAD_BYTES)):
+            return None
+    counts = sog_streamed.read_meta(path).counts
+    full = [level for level, count in enumerate(counts) if count]
+    level = next((level for level in full if counts[level] <= most), full[-1] if full else 0)
+    return level or None
+
+
+def _all_of(path: Path, level: int | None, prefix: int | None) -> str:
+    """What the finest choice is, in words."""
+    if prefix is not None:
+        return f"{size(prefix)}: as much as may be drawn"
+    if level is not None:
+        return f"level {level}"
+    return f"all of it: {size(sum(component_bytes(path).values()))}"
 
 
 def _beside(model: Renderable) -> Camera:
