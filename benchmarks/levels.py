@@ -1,6 +1,6 @@
 """A city of 3 million primitives in the page, fetched by what is in view, against loading all of it.
 
-    python benchmarks/tiles.py city FILE.cgs --side 15 --folder city.tiles --memory
+    python benchmarks/tiles.py city FILE.cgs --side 15 --largest 0.8 --folder city.tiles --memory
     python benchmarks/levels.py city.tiles [--size 1280x800] [--caps 1000000 3000000 all] [--stops 6] [--megabits 20]
     python benchmarks/levels.py city.tiles --browser --size 640x400 --output FOLDER
 

@@ -1,7 +1,7 @@
 """Scenes in tiles: what a border costs, and what memory and time it takes to fly over a city of millions.
 
     python benchmarks/tiles.py seam ONE TWO SCENE [-r 1]
-    python benchmarks/tiles.py city FILE.cgs [--side 12] [--memory 60MB] [--frames 48] [--folder city.tiles]
+    python benchmarks/tiles.py city FILE.cgs [--side 12] [--largest 0.8] [--memory 60MB] [--frames 48] [--folder DIR]
 
 `seam`: ONE is the run of a scene trained whole, TWO that of the same in tiles. Held-out views of both against the
 photographs: all pixels, and those that show what is near a border. Which these are the scene trained whole says: its
@@ -109,14 +109,16 @@ def decibels(squares: float) -> float:
 # a city ------------------------------------------------------------------------------------------------------------
 
 
-def make_city(file: Path, folder: Path, side: int) -> None:
-    """`side` x `side` times the middle of a file."""
+def make_city(file: Path, folder: Path, side: int, largest: float = math.inf) -> None:
+    """`side` x `side` times the middle of a file, without anchors that reach farther than `largest` world units: walls
+    and skies of so many captures would stand in front of each other.
+    """
     data = file.read_bytes()
     model, content = decode_bytes(data, file), read_content(data)
     ground = ground_of(model.viewpoints, model.primitives.positions)
     places = np.abs(ground.places(model.primitives.positions + np.array(model.world_offset))).max(1)
     half = float(np.quantile(places, CORE_SHARE))
-    inside = places <= half
+    inside = (places <= half) & (model.bounds[1] < largest)
     tile = without_coupled(content, np.repeat(inside, content.mask.sum(1)))
     right, forward = 2 * half * np.array(ground.right), 2 * half * np.array(ground.forward)
 
@@ -190,7 +192,7 @@ def peak() -> int:
 def city(options: argparse.Namespace) -> None:
     """Prints a table."""
     if not (options.folder / "manifest.json").is_file():
-        make_city(options.file, options.folder, options.side)
+        make_city(options.file, options.folder, options.side, options.largest)
     rows = []
     for memory in (None, *(parse_size(size, "--memory") for size in options.memory)):
         words = [sys.executable, __file__, "fly", str(options.folder), "--frames", str(options.frames)]
@@ -237,6 +239,7 @@ def main() -> None:
     two = commands.add_parser("city")
     two.add_argument("file", type=Path)
     two.add_argument("--side", type=int, default=12)
+    two.add_argument("--largest", type=float, default=math.inf, help="world units an anchor may reach")
     two.add_argument("--memory", nargs="*", default=["60MB"])
     two.add_argument("--frames", type=int, default=48)
     two.add_argument("--folder", type=Path, default=Path("city.tiles"))
