@@ -8,8 +8,9 @@ The rows: the .cgs file; the .spz and .sog that `compgs export` makes of it; wit
 methods pruned-spz and pruned-sog). Bytes are those of the files; PSNR, SSIM and LPIPS those of `compgs evaluate` on
 the held-out views. Milliseconds are from the beginning of a page to the first picture with anything in it, and to the
 last change of the picture, in a headless Chromium that draws with Spark by software, while the file comes at --mbit
-megabits a second: medians of --times visits. What OUT has already is not made again. Needs Node and the packages of
-web/ (`make web`), chromium and the Python package websockets.
+megabits a second: medians of --times visits. "Drawn" compares the last picture with this program's of the same file.
+What OUT has already is not made again. Needs Node and the packages of web/ (`make web`), chromium and the Python
+package websockets.
 """
 
 import argparse
@@ -28,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import compgs
+from compgs import metrics
 from compgs.cameras import Camera
 from compgs.methods import settings_of, train
 from compgs.methods.pruned import PrunedSection
@@ -189,9 +191,13 @@ def in_browser(entries: list[Entry], model: Any, options: argparse.Namespace) ->
                     return (first, last) if first and now - last > 1000 * QUIET_SECONDS else None
 
                 visits.append(until(settled, f"a picture of {entry.file.name}", MOST_SECONDS))
+                drawn = opened.picture()
             shutil.rmtree(folder, ignore_errors=True)
         first, last = (statistics.median(values) for values in zip(*visits, strict=True))
-        found.append({"first_ms": first, "last_ms": last})
+        expected = metrics.to_8bit(
+            compgs.render(compgs.open_scene(entry.file, background=model.background), camera).image
+        )
+        found.append({"first_ms": first, "last_ms": last, "drawn_db": metrics.psnr(drawn, expected)})
         print(f"{entry.file.name}: {first:.0f} ms, {last:.0f} ms", file=sys.stderr, flush=True)
     return found
 
@@ -287,15 +293,16 @@ def served(html: bytes, script: bytes, file: Path, mbit: float) -> Iterator[str]
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown."""
     lines = [
-        "| file | bytes | times ours | PSNR, dB | SSIM | LPIPS | first picture, ms | last picture, ms |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|",
+        "| file | bytes | times ours | PSNR, dB | SSIM | LPIPS | first picture, ms | last picture, ms | drawn, dB |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for row in rows:
         lpips = "" if row["lpips_3dgs"] is None else f"{row['lpips_3dgs']:.3f}"
         first, last = (f"{row[name]:,.0f}" if name in row else "" for name in ("first_ms", "last_ms"))
+        drawn = f"{row['drawn_db']:.1f}" if "drawn_db" in row else ""
         lines.append(
             f"| {row['name']} | {row['bytes']:,} | {row['bytes'] / rows[0]['bytes']:.1f} | {row['psnr']:.2f} "
-            f"| {row['ssim']:.4f} | {lpips} | {first} | {last} |"
+            f"| {row['ssim']:.4f} | {lpips} | {first} | {last} | {drawn} |"
         )
     return "\n".join(lines)
 

@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
 sys.path.append(str(ROOT / "benchmarks"))
 import ablation_tables  # noqa: E402
+import beside as beside_benchmark  # noqa: E402
 import complexity  # noqa: E402
 import prefix as prefix_benchmark  # noqa: E402
 import quality_over_bytes  # noqa: E402
@@ -374,6 +375,11 @@ def curves(name: str, *tables: str) -> str:
     return quality_over_bytes.table(quality_over_bytes.points_of(quality_over_bytes.drawn(every)))
 
 
+def beside(name: str) -> str:
+    """Return the files of a scene beside those of other programs (benchmarks/beside.py)."""
+    return beside_benchmark.table(_json(RESULTS / f"beside_{name}.json"))
+
+
 def prefix(name: str) -> str:
     """Quality of the beginnings of a file."""
     lines = prefix_benchmark.report({**_json(RESULTS / f"prefix_{name}.json"), "commit": ""}, "").splitlines()
@@ -392,7 +398,7 @@ FUNCTIONS: dict[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
         captures, printed, gallery, measured, paper, components, methods, compared, ablation, ablation_components,
-        complexity_time, complexity_memory, curves, prefix, similar,
+        complexity_time, complexity_memory, curves, prefix, similar, beside,
     )
 }  # fmt: skip
 
