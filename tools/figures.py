@@ -5,8 +5,8 @@
 
 A page has figures between two comments, `<!-- figures: NAME -->` and `<!-- end of figures -->`. NAME says what stands
 there: a function of this file, and what it is given. Records are docs/results/records/*.json, which tools/record.py
-writes, and the tables and records that the benchmarks leave in docs/results. A test compares all pages with their
-records, and the settings and decisions of each record with those of today's default preset.
+writes, and the tables and records that the benchmarks leave in docs/results. A row whose run today's preset would train
+otherwise names its commit. A test compares all pages with their records.
 """
 
 import argparse
@@ -16,10 +16,13 @@ import re
 import sys
 import tomllib
 from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from compgs.config import load_config
 from compgs.outputs import write_bytes
+from compgs.training.plan import RULES, Plan, plan
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -40,6 +43,8 @@ BLOCK = re.compile(
 
 # The records that come first in the tables: the paper's scenes.
 FIRST = ("truck", "bonsai")
+# Of a run, said by its command; all else is the preset's.
+ASKED = ("lmbda", "steps", "seed", "target_bytes")
 Record = dict[str, Any]
 
 
@@ -68,6 +73,35 @@ def records() -> list[Record]:
     return sorted(found, key=lambda record: (record["name"] not in FIRST, -record["results"]["bytes"]))
 
 
+def outdated(record: Record) -> list[str]:
+    """Return the settings and decisions that today's preset would have otherwise in the run of a record."""
+    today = load_config(record["preset"])
+    asked = {name: record["settings"]["training"][name] for name in ASKED}
+    config = replace(today, training=replace(today.training, **asked))
+    ran = Plan.from_dict(
+        record["plan"]
+    )  # a decision that the run did not know yet has the value that changes nothing
+    now = plan(config, ran.start)
+    decided = {f.name for f in fields(Plan)} - {"start", "reasons"}
+    found = [name for name in sorted(decided) if getattr(ran, name) != getattr(now, name)]
+    before, after = flat(record["settings"]), flat(json.loads(json.dumps(config.to_dict())))
+    by_rules = {rule.sets for rule in RULES}
+    found += [n for n in before if before[n] != after.get(n) and n.rpartition(".")[2] not in by_rules]
+    return found
+
+
+def flat(settings: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return section.name -> value."""
+    return {
+        f"{section}.{name}": value for section, values in settings.items() for name, value in values.items()
+    }
+
+
+def titled(record: Record, link: str) -> str:
+    """Return the name of the capture, and the commit if today's preset would train otherwise."""
+    return link + (f", at {record['commit']}" if outdated(record) else "")
+
+
 def captures(folder: str) -> str:
     """A row for each record, in a few columns. `folder` leads from the page to docs/results."""
     lines = [
@@ -75,7 +109,7 @@ def captures(folder: str) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for record in records():
-        results, title = record["results"], f"[{record['title']}]({folder}/{record['page']})"
+        results, title = record["results"], titled(record, f"[{record['title']}]({folder}/{record['page']})")
         lines.append(
             f"| {title} | {views(record)} | {number(record['training']['steps'])} | {minutes(record)} | "
             f"{results['psnr']:.2f} dB | {results['ssim']:.3f} | **{size(results['bytes'])}** |"
@@ -130,18 +164,8 @@ def gallery() -> str:
 
 def measured(*names: str) -> str:
     """A row for each record of these names, or for each, with all that was measured."""
-    head = [
-        "capture",
-        "command",
-        "commit",
-        "held-out views",
-        "PSNR",
-        "SSIM",
-        "LPIPS, as 3DGS / as trained",
-        "bytes",
-        "anchors",
-    ]
-    head += ["bits an anchor", "training", "decoding", "a view"]
+    head = ["capture", "command", "commit", "held-out views", "PSNR", "SSIM", "LPIPS, as 3DGS / as trained"]
+    head += ["bytes", "anchors", "bits an anchor", "training", "decoding", "a view"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for record in records():
         if names and record["name"] not in names:
@@ -149,7 +173,7 @@ def measured(*names: str) -> str:
         r = record["results"]
         lpips = "" if r["lpips"] is None else f"{r['lpips_3dgs']:.3f} / {r['lpips']:.3f}"
         cells = [
-            record["title"],
+            titled(record, record["title"]),
             f"`{record['command']}`",
             record["commit"],
             f"{r['views']} of {r['width']} x {r['height']}",
@@ -159,12 +183,23 @@ def measured(*names: str) -> str:
             number(r["bytes"]),
             number(r["anchors"]),
             f"{r['bits_per_anchor']:.1f}",
-            f"{minutes(record)} {record['note']}".strip(),
-            f"{1e3 * r['decode_seconds']:.0f} ms",
-            f"{1e3 * r['render_seconds']:.0f} ms",
+            *times(record),
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def times(record: Record) -> list[str]:
+    """Of training, decoding and rendering; only why there are none, where other work made them meaningless."""
+    r, note = record["results"], record["note"]
+    if not is_timed(record):
+        return [note, "", ""]
+    ms = [f"{1e3 * r[name]:.0f} ms" for name in ("decode_seconds", "render_seconds")]
+    return [f"{minutes(record)} {note}".strip(), *ms]
+
+
+def is_timed(record: Record) -> bool:
+    return not record["note"].startswith("not timed")
 
 
 def components(name: str) -> str:
@@ -187,7 +222,9 @@ def views(record: Record) -> str:
 
 
 def minutes(record: Record) -> str:
-    """The seconds of the training, as people say them."""
+    """The seconds of the training, as people say them; none where other work made them meaningless."""
+    if not is_timed(record):
+        return "not timed"
     seconds = record["training"]["seconds"]
     return f"{seconds / 60:.0f} min" if seconds >= 600 else f"{seconds / 60:.1f} min"
 
