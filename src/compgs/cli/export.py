@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Export(DecodingCommand, SceneFileArgument, LevelOption):
-    """Write a scene as plain splats (.ply, .spz, .sog, .glb), with levels of detail (lod-meta.json), or as a web page
-    that shows it (.html).
+    """Write a scene as plain splats (.ply, .spz, .sog, .glb), levels of detail (lod-meta.json), or a web page (.html).
 
     In a .cgs file opacity and color depend on where one stands; other programs know harmonics. They are fitted
     over the cameras that the file holds, and what that costs is measured: the new file is read again and its
