@@ -1,6 +1,7 @@
 """What is installed: the wheel has the files of the package and no others, says what it is, and works elsewhere."""
 
 import email
+import os
 import re
 import subprocess
 import sys
@@ -132,7 +133,12 @@ def test_the_installed_package_does_what_somebody_does_who_has_received_a_file(
 ) -> None:
     def run(*command: object) -> str:
         done = subprocess.run(
-            [str(part) for part in command], cwd=tmp_path, capture_output=True, text=True, timeout=900
+            [str(part) for part in command],
+            cwd=tmp_path,
+            env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+            capture_output=True,
+            text=True,
+            timeout=900,
         )
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
