@@ -67,7 +67,12 @@ ALLOWED = {
     | {"model", "render", "devices", "codec", "methods"},  # up for a method's own files, which name it
     "training": BASE
     | {"scene", "render", "model", "tensors", "devices", "entropy", "losses", "metrics", "trained_model"}
-    | {"stereo", "stored_weights", "codec", "ordering"},  # what positions and masks take, for a size that is asked for
+    | {
+        "stereo",
+        "stored_weights",
+        "codec",
+        "ordering",
+    },  # what positions and masks take, for a size that is asked for
     "methods": BASE
     | {"scene", "model", "entropy", "render", "tensors", "devices", "losses", "metrics", "codec", "formats"}
     | {"training", "trained_model", "stored_weights", "ordering"},

@@ -131,3 +131,12 @@ def test_what_is_seen_already_counts_less_for_a_candidate_that_is_liked_less() -
     # After the first: {0, 1, 2} again 0.2 x 3/2, {1, 2} again 1, {3} for the first time 1, liked or not.
     liking = np.array([1.0, 0.2, 0.9, 0.2])
     assert cover(candidates, np.ones(4), liking, 3, np.random.default_rng(0)) == [0, 3, 2]
+
+
+@pytest.mark.parametrize(("until", "looked_at"), [(None, 240), (1e9, 240), (0.0, 60)])
+def test_where_time_is_short_fewer_places_are_looked_for(ball, until: float | None, looked_at: int) -> None:
+    told: list[int] = []
+    found = place_cameras(
+        ball.model, 80, 2, lens=LENS, until=until, progress=lambda done, _: told.append(done)
+    )
+    assert told[-1] == looked_at and len(found.train) == min(80, looked_at) and len(found.held_out) == 2

@@ -43,6 +43,7 @@ from compgs.training.run.loop import chosen_device as training_device
 
 SPLATS_PER_ANCHOR = 4.0  # at the start; growth adds anchors, pruning removes them
 HELD_OUT_EVERY = 8  # of given cameras, by name: as scenes are split (`load_scene`)
+FOR_PLACES = 0.15  # of a given time: until places to look from are found
 FOR_THE_REST = 0.1  # of a given time: the last look at all views, and writing the file
 NEEDED_BYTES = 64 << 20  # checkpoint, file and pictures of a small scene
 STEPS = 8000  # unless a preset or a time is asked for: minutes on two cores
@@ -217,7 +218,8 @@ def begin(
         raise ConfigError(f"seconds = {seconds}: expected more than none")
     check_places(output, overwrite=overwrite)
     splats = opened(source, looking, device)
-    placed = placed_cameras(splats, looking, config.training.seed, progress)
+    until = None if seconds is None else start + FOR_PLACES * seconds
+    placed = placed_cameras(splats, looking, config.training.seed, progress, until)
     scene, size = scene_of(splats, placed, source, config)
     config = replace(config, model=replace(config.model, voxel_size=size))
     deadline = None
@@ -300,13 +302,22 @@ def digest(splats: SplatModel) -> str:
 
 
 def placed_cameras(
-    splats: SplatModel, looking: Looking, seed: int, progress: Progress | None = None
+    splats: SplatModel,
+    looking: Looking,
+    seed: int,
+    progress: Progress | None = None,
+    until: float | None = None,
 ) -> Placed:
-    """Cameras that are placed, or those that are given and more between them. Raises SceneError."""
+    """Cameras that are placed, or those that are given and more between them; `until` as in `place_cameras`.
+
+    Raises SceneError.
+    """
     if looking.cameras is None:
         lens = Lens(looking.width, looking.height)
         count = looking.views, looking.held_out
-        return place_cameras(splats, *count, lens=lens, up=looking.up, seed=seed, progress=progress)
+        return place_cameras(
+            splats, *count, lens=lens, up=looking.up, seed=seed, progress=progress, until=until
+        )
     given = [looking.fitted(camera) for camera in given_cameras(looking.cameras)]
     trained = [camera for i, camera in enumerate(given) if i % HELD_OUT_EVERY]
     more = max(0, looking.views - len(trained))

@@ -4,6 +4,7 @@ splats ──► shape ──► candidates ──probe──► those in the op
                                                                                   └─between──► held out
 """
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -19,6 +20,7 @@ from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_
 
 UP = (0.0, -1.0, 0.0)  # as COLMAP's worlds usually come out, and most files of splats with them
 CANDIDATES = 3.0  # for each camera that is wanted
+FEWEST_PLACES = 60  # candidates that are looked for however long it takes, or as many as cameras are wanted
 TRIES = 12  # places for each candidate; in the open at least one of them is expected to be
 SAMPLED = 20_000  # splats by which cameras are chosen
 WELL_SEEN = 0.1  # of the largest weight that a splat has in any candidate's picture
@@ -46,11 +48,13 @@ def place_cameras(
     up: tuple[float, float, float] = UP,  # direction of the sky
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
+    until: float | None = None,
 ) -> Placed:
     """`count` cameras that between them see each splat that matters several times, and `held_out` others between them.
 
-    The same ones for the same seed. `progress(done, total)` counts candidates. Raises SceneError if there is no place
-    to look from.
+    The same ones for the same seed. `progress(done, total)` counts candidates. After `until`, on the clock of
+    `time.monotonic`, no more of them are looked for than are needed. Raises SceneError if there is no place to look
+    from.
     """
     chance = np.random.default_rng(seed)
     upward = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
@@ -66,7 +70,8 @@ def place_cameras(
         probes.append(looked)
         if progress:
             progress(len(cameras), wanted)
-        if len(cameras) == wanted:
+        late = until is not None and time.monotonic() > until
+        if len(cameras) == wanted or (late and len(cameras) >= min(count, FEWEST_PLACES)):
             break
     if len(cameras) < 2:
         raise SceneError(
