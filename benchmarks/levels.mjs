@@ -1,8 +1,8 @@
 /**
- * What a page does with a scene of tiles but draw it: node levels.mjs MANIFEST_ADDRESS MOST < cameras.json
+ * What a page does with a scene of tiles but draw it: node levels.mjs MANIFEST_ADDRESS MOST [plan] < cameras.json
  *
  * Fetches, decodes, predicts and sorts for one camera after the other, as the worker of the viewer does, then moves about
- * the last one. Prints JSON; benchmarks/levels.py makes a table of it.
+ * the last one. With `plan` nothing is fetched or decoded: bytes and splats alone are counted. Prints JSON; benchmarks/levels.py makes a table of it.
  */
 
 import { readFileSync } from "node:fs";
@@ -30,13 +30,13 @@ const { outputFiles } = await build({
   write: false,
 });
 const source = Buffer.from(outputFiles[0].text).toString("base64");
-const { TileLoader, Predictor, SplatStore, isInView, readManifest, rowsOf } = await import(
+const { TileLoader, Predictor, SplatStore, isInView, planDetail, readManifest, rowsOf, sizeOf } = await import(
   `data:text/javascript;base64,${source}`
 );
 const { wasmKernels } = await import(`${web}dist/compgs.js`);
 
 const MOVING = 60; // pictures
-const [address, most] = process.argv.slice(2);
+const [address, most, plan] = process.argv.slice(2);
 const cameras = JSON.parse(readFileSync(0, "utf8"));
 const kernels = await wasmKernels();
 
@@ -50,6 +50,10 @@ let sorted = 0;
 const began = [performance.now(), processor()];
 const text = await (await fetch(address)).text();
 const manifest = readManifest(text);
+if (plan) {
+  console.log(JSON.stringify({ stops: planned() }));
+  process.exit(0);
+}
 const store = new SplatStore(
   (message) => {
     if (message.kind !== "frame") return;
@@ -112,3 +116,22 @@ for (let i = 0; i < MOVING; i++) {
 const moving = { seconds: (performance.now() - time) / 1000, processor: processor() - used, pictures: MOVING };
 console.log(JSON.stringify({ stops, moving, memory: process.memoryUsage().rss }));
 process.exit(0);
+
+/** Bytes and splats after each camera. */
+function planned() {
+  const { tiles } = manifest;
+  const sizes = tiles.map(sizeOf);
+  const loaded = tiles.map(() => 0);
+  let kept = new Int32Array(tiles.length);
+  return cameras.map((camera) => {
+    kept = planDetail(tiles, sizes, camera, Number(most), kept).levels;
+    let splats = 0;
+    tiles.forEach(({ levels }, i) => {
+      if (!kept[i]) return;
+      splats += levels[kept[i] - 1].coupled;
+      loaded[i] = Math.max(loaded[i], levels[kept[i] - 1].bytes);
+    });
+    const inView = tiles.filter((tile) => isInView(tile, camera)).length;
+    return { bytes: text.length + loaded.reduce((sum, bytes) => sum + bytes, 0), splats, inView };
+  });
+}

@@ -255,17 +255,23 @@ def main() -> None:
     parser.add_argument(
         "--pictures", action="store_true", help="only how near views are to those of everything"
     )
+    parser.add_argument(
+        "--plan", action="store_true", help="only bytes and splats of the walk, which take no time"
+    )
     parser.add_argument("--output", type=Path, help="folder for levels.json and pictures")
     options = parser.parse_args()
     devtools.MAX_SECONDS = MOST_SECONDS  # a page that draws by software may answer late
     width, height = map(int, options.size.split("x"))
-    cameras = [camera.resized(width, height) for camera in flight(options.city, options.stops)]
+    cameras = [camera.resized(width, height) for camera in flight(options.city, options.stops + 1)[:-1]]
     manifest = read_manifest(options.city / MANIFEST)
     tiles, offset = manifest.tiles, np.array(manifest.world_offset)
     print(
         f"{len(tiles)} tiles, {sum(t.coupled_primitives for t in tiles):,} coupled primitives, "
         f"{sum(t.bytes for t in tiles) / 1e6:.1f} MB; {width} x {height}, {options.megabits:g} Mbit/s"
     )
+    if options.plan:
+        count(options.city, cameras, offset, options.caps)
+        return
     if options.pictures:
         compare(options.city, cameras, [int(cap) for cap in options.caps if cap != ALL], options.output)
         return
@@ -331,6 +337,36 @@ def _sight(camera: Camera) -> dict[str, Any]:
     """A camera as the page's tiles know it."""
     lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy")}
     return lens | {"centre": camera.center.tolist(), "rotation": camera.rotation.ravel().tolist()}
+
+
+def count(city: Path, cameras: list[Camera], offset: np.ndarray, caps: list[str]) -> None:
+    """Prints a table of what is fetched and shown at each stop."""
+    sights = json.dumps([_sight(camera.moved(offset)) for camera in cameras])
+    print("| at most | stop | tiles in view | splats | MB so far |\n|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory(dir=city.parent) as folder:
+        whole = without_levels(city, Path(folder))
+        with serving(city.parent, 1e6) as server:
+            for cap in caps:
+                place = f"{Path(folder).name}/{whole.name}" if cap == ALL else city.name
+                address = f"{server.address}/files/{place}/{MANIFEST}"
+                command = [
+                    "node",
+                    str(Path(__file__).with_suffix(".mjs")),
+                    address,
+                    str(10**9) if cap == ALL else cap,
+                ]
+                done = subprocess.run(
+                    [*command, "plan"], input=sights, check=True, stdout=subprocess.PIPE, text=True
+                )
+                for number, stop in enumerate(json.loads(done.stdout)["stops"]):
+                    values = [
+                        cap,
+                        f"{number}",
+                        f"{stop['inView']}",
+                        f"{stop['splats']:,}",
+                        f"{stop['bytes'] / 1e6:.2f}",
+                    ]
+                    print(f"| {' | '.join(values)} |", flush=True)
 
 
 def compare(city: Path, cameras: list[Camera], caps: list[int], folder: Path | None) -> None:
