@@ -45,13 +45,12 @@ def one_size(anchors: int, steps: int, *, encode: bool) -> dict[str, Any]:
     from compgs.training.run.checkpoint import Writer
     from compgs.training.run.distributed import digest
     from compgs.training.run.profile import StepProfile
-    from compgs.training.trainer import PARTS, stations
 
     with freed_memory_kept():
         trainer_in_mid_run(*made_scene(500, 64, 48)).train_step()  # loads the kernels
         trainer = trainer_in_mid_run(*made_scene(anchors, *SIZE))
         profile = StepProfile(warm_up=1, clock=time.process_time)
-        profile.watch(trainer, PARTS, stations)
+        profile.watch(trainer, trainer.PROFILED, trainer.stations)
         trainer.train_step()
         step, _ = measured(lambda: [trainer.train_step() for _ in range(steps)])
         found: dict[str, Any] = {
@@ -62,7 +61,9 @@ def one_size(anchors: int, steps: int, *, encode: bool) -> dict[str, Any]:
         }
         views = len(trainer.scene.train_views)
         rare: dict[str, tuple[float, float]] = {}
-        rare["bounds of culling"] = measured(lambda: (trainer.bounds.forget(), trainer.bounds.radii()))
+        rare["bounds of culling"] = measured(
+            lambda: (trainer.survey.bounds.forget(), trainer.survey.bounds.radii())
+        )
         rare["estimate of the size"] = measured(trainer.estimated_bytes)
         each = measured(lambda: trainer.survey.contributions(views))
         rare["contributions, a view"] = each[0] / views, each[1] / views
@@ -76,10 +77,12 @@ def one_size(anchors: int, steps: int, *, encode: bool) -> dict[str, Any]:
             rare["checkpoint beside the steps"] = measured(lambda: trainer.save(path, writer))
             writer.finish()
             found["checkpoint_mb"] = path.stat().st_size / 1e6
-            rare["principal axes"] = measured(trainer.turn_references)
+            rare["principal axes"] = measured(
+                lambda: trainer.structure.turn_references(trainer.step, trainer.rate)
+            )
             found["asking"] = int((trainer.control.gradient > 0).sum())
             trainer.control.drawn += 1000.0  # all have been seen often enough to be judged
-            rare["growth"] = measured(trainer.grow)
+            rare["growth"] = measured(lambda: trainer.structure.grow(trainer.step, trainer.rate))
             found["grown"] = trainer.model.anchors
             if encode:
                 from compgs.codec import decode

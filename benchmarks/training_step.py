@@ -57,7 +57,9 @@ def trainer_in_mid_run(scene: Any, config: Any, model: Any = None) -> Any:
 
 def visible_share(trainer: Any) -> float:
     views = trainer.scene.train_views[:8]
-    return sum(len(trainer.visible_anchors(v.camera)) for v in views) / len(views) / trainer.model.anchors
+    return (
+        sum(len(trainer.survey.visible_anchors(v.camera)) for v in views) / len(views) / trainer.model.anchors
+    )
 
 
 def timed_step(trainer: Any) -> float:
@@ -72,7 +74,6 @@ def breakdown(options: argparse.Namespace) -> dict[str, Any]:
     from compgs.scene import load_scene
     from compgs.training.run.checkpoint import CHECKPOINT_NAME, load_checkpoint
     from compgs.training.run.profile import WARM_UP, StepProfile
-    from compgs.training.trainer import PARTS, stations
 
     scene = load_scene(options.scene[0], downscale=options.downscale[0])
     model, config = None, Config()
@@ -85,7 +86,7 @@ def breakdown(options: argparse.Namespace) -> dict[str, Any]:
         model.mask[:] = True
     trainer = trainer_in_mid_run(scene, config, model)
     profile = StepProfile()
-    profile.watch(trainer, PARTS, stations)
+    profile.watch(trainer, trainer.PROFILED, trainer.stations)
     for _ in range(WARM_UP):
         trainer.train_step()
     before = time.process_time()

@@ -12,7 +12,7 @@ from compgs.scene import as_scene
 from compgs.scene.generated import generate_scene
 from compgs.scene.views import Scene
 from compgs.training import Trainer, train_splats
-from compgs.training.run.loop import chosen_config, chosen_device
+from compgs.training.run.run import chosen_config, chosen_device
 
 GOLDEN = Path(__file__).parent / "golden" / "trained.cgs"
 

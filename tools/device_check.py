@@ -366,6 +366,7 @@ def one_step(device: str) -> dict[str, Any]:
     from compgs.losses import rate, rate_distortion_loss
     from compgs.scene import load_scene
     from compgs.scene.generated import generate_scene
+    from compgs.training.survey import predict_view
     from compgs.training.trainer import Trainer
 
     with tempfile.TemporaryDirectory() as folder:
@@ -382,12 +383,12 @@ def one_step(device: str) -> dict[str, Any]:
                 parameter += 0.1 * torch.randn(parameter.shape, generator=chance)
         trainer = Trainer(scene, trainer.config, torch.device(device), trainer.model)
         model, camera = trainer.model, scene.train_views[0].camera
-        rows = trainer.visible_anchors(camera)
+        rows = trainer.survey.visible_anchors(camera)
         latents = model.quantized(rows, rate=True, noise=None, stored_weights=False)
-        prediction = trainer.predict(latents, rows, camera, False)
-        rendered = trainer.rasterize(prediction.gaussians, camera)
-        loss = trainer.compare(rendered, trainer.views.photograph(0))
-        loss = loss + trainer.regularize(prediction, prediction.gaussians, camera)
+        prediction = predict_view(model, latents, rows, camera, stored=False)
+        rendered = trainer.pictures.rasterize(prediction.gaussians, camera, watched=True)
+        loss = trainer.pictures.compare(rendered, trainer.views.photograph(0))
+        loss = loss + trainer.gradients.regularize(prediction, prediction.gaussians, camera)
         bits = rate(latents.bits, model.entropy.channels, config.training.rate)
         rate_distortion_loss(loss, bits, training.lmbda).backward()
         found = {"image": rendered.image, "loss": loss[None], "bits": bits[None]}

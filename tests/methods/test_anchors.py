@@ -16,8 +16,8 @@ from compgs.methods.anchors.trainer import PARTS, AnchorTrainer, train_anchors
 from compgs.model.constants import CUTOFF_SIGMAS
 from compgs.render import Renderable
 from compgs.scene.views import Scene
-from compgs.training.run.loop import Run
 from compgs.training.run.profile import StepProfile
+from compgs.training.run.run import Run
 
 K = 3
 

@@ -15,7 +15,7 @@ from compgs.training.run.checkpoint import (
     read_checkpoint_file,
     write_checkpoint_file,
 )
-from compgs.training.run.loop import Pace
+from compgs.training.run.pace import Pace
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")

@@ -249,7 +249,7 @@ def test_a_run_grows_by_the_lambda_that_it_has_come_to(blob_scene, tiny_config):
         trainer.control.gradient[:] = 3 * 1000 * control.gradient_threshold
         trainer.rate = RateState(lmbda)
         before = trainer.model.anchors
-        trainer.grow()
+        trainer.structure.grow(trainer.step, trainer.rate)
         anchors[lmbda] = trainer.model.anchors - before
     assert anchors[0.002] > anchors[0.1] == 0
 
@@ -258,11 +258,11 @@ def test_a_size_is_followed_gently_before_statistics_are_gathered(blob_scene, ti
     """Anchors are still to come then: `grown` is false."""
     config = replace(tiny_config, training=replace(tiny_config.training, target_bytes=10**6, rate_start=0.0))
     trainer = Trainer(blob_scene, config, CPU)
-    trainer.target_size.schedule = ControlSchedule(start=20, stop=30, every=8, observe=15)
+    trainer.structure.target_size.schedule = ControlSchedule(start=20, stop=30, every=8, observe=15)
     asked = []
     monkeypatch.setattr(target_size, "follow", lambda state, *_, grown, **__: asked.append(grown) or state)
     for step in (10, 20, 29, 30):
-        trainer.target_size.follow(trainer.rate, step)
+        trainer.structure.target_size.follow(trainer.rate, step)
     assert asked == [False, False, False, True]
 
 

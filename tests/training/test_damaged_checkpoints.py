@@ -13,7 +13,7 @@ import safetensors.torch
 import torch
 
 from compgs.errors import CheckpointError
-from compgs.training.run.checkpoint import load_checkpoint
+from compgs.training.run.model_checkpoint import load_checkpoint
 from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 

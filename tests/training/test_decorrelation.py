@@ -10,7 +10,7 @@ import torch
 from compgs.codec import decode, encode
 from compgs.config import Config, load_config
 from compgs.scene.views import Scene
-from compgs.training import trainer as trainer_module
+from compgs.training.structure import events
 from compgs.training.structure.decorrelation import (
     channel_rates,
     decorrelate,
@@ -18,6 +18,7 @@ from compgs.training.structure.decorrelation import (
     keep_channels,
     principal_axes,
 )
+from compgs.training.survey import predict_view
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -48,9 +49,9 @@ def trained(
 
 def predicted(trainer: Trainer) -> tuple[torch.Tensor, ...]:
     view = trainer.scene.train_views[2]
-    rows = trainer.visible_anchors(view.camera)
+    rows = trainer.survey.visible_anchors(view.camera)
     latents = trainer.model.quantized(rows, stored_weights=False)
-    prediction = trainer.predict(latents, rows, view.camera, stored=False)
+    prediction = predict_view(trainer.model, latents, rows, view.camera, stored=False)
     g = prediction.gaussians
     return g.means, g.scales, g.opacities, g.colors
 
@@ -182,9 +183,9 @@ def test_channels_go_at_the_last_turn_alone_and_rates_follow_at_each(
         trainer = Trainer(blob_scene, config, CPU)
         uncorrelated(trainer, torch.tensor([0.1, 9.0, 1.0, 0.2, 5.0, 3.0, 8.0, 4.0]))
         trainer.step = step
-        trainer.turn_references()
+        trainer.structure.turn_references(trainer.step, trainer.rate)
         assert trainer.model.reference_dim == channels
-        assert torch.equal(trainer.channel_rates.values, channel_rates(trainer.model.references))
+        assert torch.equal(trainer.structure.channel_rates.values, channel_rates(trainer.model.references))
 
 
 def test_a_step_with_momentum_does_not_care_when_the_axes_turn(
@@ -355,7 +356,7 @@ def test_it_happens_at_the_steps_that_the_settings_name(
     config = replace(tiny_config, entropy=replace(tiny_config.entropy, decorrelate_at=(0.2, 0.5)))
     trainer = Trainer(blob_scene, config, CPU)
     turned: list[int] = []
-    monkeypatch.setattr(trainer_module, "decorrelate", lambda *_: turned.append(trainer.step))
+    monkeypatch.setattr(events, "decorrelate", lambda *_: turned.append(trainer.step))
     for _ in range(config.training.steps):
         trainer.train_step()
     assert turned == [8, 20]
@@ -363,11 +364,11 @@ def test_it_happens_at_the_steps_that_the_settings_name(
 
 def test_a_run_that_has_diverged_is_left_as_it_is(blob_scene: Scene, tiny_config: Config) -> None:
     trainer = Trainer(blob_scene, tiny_config, CPU)
-    trainer.step = max(trainer.decorrelated_at)
+    trainer.step = max(trainer.structure.decorrelated_at)
     with torch.no_grad():
         trainer.model.references[0, 0] = float("nan")
     before = trainer.model.references.detach().clone()
-    trainer.turn_references()
+    trainer.structure.turn_references(trainer.step, trainer.rate)
     assert trainer.model.reference_dim == tiny_config.model.reference_dim
     assert torch.equal(trainer.model.references.nan_to_num(), before.nan_to_num())
 

@@ -19,8 +19,8 @@ from compgs.scene.colmap import read_sparse_model
 from compgs.scene.colmap_writer import write_sparse_model
 from compgs.scene.generated import generate_scene
 from compgs.training import train, train_splats
-from compgs.training.run.checkpoint import load_checkpoint
-from compgs.training.run.loop import CHECKPOINT_NAME
+from compgs.training.run.checkpoint import CHECKPOINT_NAME
+from compgs.training.run.model_checkpoint import load_checkpoint
 from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 

@@ -10,6 +10,7 @@ from compgs.tensors.gradient_sampling import GradientSizes
 from compgs.tensors.rasterize import rasterize
 from compgs.training.shortcuts.hidden import HiddenAnchors
 from compgs.training.step.step_views import step_views
+from compgs.training.survey import predict_view
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -130,13 +131,13 @@ def test_steps_with_the_rate_look_at_all_and_others_at_what_showed(trainer):
     seen = []
     for _ in range(8):
         views, step = trainer.views, trainer.step
-        looks = trainer.look()
+        looks = trainer.look(trainer.now)
         (view,) = looks.views
-        everything = trainer.visible_anchors(trainer.scene.train_views[view].camera)
+        everything = trainer.survey.visible_anchors(trainer.scene.train_views[view].camera)
         shown = everything if step % 4 == 0 else trainer.hidden.others(view, everything)
         assert torch.equal(looks.own.rows, shown)
         seen.append(len(everything) - len(shown))
-        trainer.learn(looks)
+        trainer.learn(looks, trainer.now)
         trainer.step += 1
         assert trainer.views is views
     assert max(seen) > 0, "nothing was hidden: the scene does not test anything"
@@ -146,16 +147,16 @@ def test_steps_with_the_rate_look_at_all_and_others_at_what_showed(trainer):
 def test_a_view_hardly_changes_without_what_is_hidden_in_it(trainer):
     chance, changes, left_out = torch.Generator().manual_seed(0), [], 0
     for number, view in enumerate(trainer.scene.train_views):
-        rows = trainer.visible_anchors(view.camera)
-        trainer.learn(
-            step_views([number], [rows], trainer.model.anchors, trainer.noise)
-        )  # looks, and moves nothing
+        rows = trainer.survey.visible_anchors(view.camera)
+        looks = step_views([number], [rows], trainer.model.anchors, trainer.noise)
+        trainer.learn(looks, trainer.now)  # looks, and moves nothing
         shown = trainer.hidden.others(number, rows)
         as_many = rows[torch.randperm(len(rows), generator=chance)[: len(shown)].sort().values]
         images = []
         with torch.no_grad():
             for some in (rows, shown, as_many):
-                prediction = trainer.predict(trainer.model.quantized(some), some, view.camera, stored=False)
+                model = trainer.model
+                prediction = predict_view(model, model.quantized(some), some, view.camera, stored=False)
                 images.append(rasterize(prediction.gaussians, view.camera, trainer.settings).image)
         changes.append([(images[0] - image).abs().mean() for image in images[1:]])
         left_out += len(rows) - len(shown)

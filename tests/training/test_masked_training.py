@@ -8,7 +8,7 @@ import torch
 
 from compgs.losses import Target
 from compgs.scene.views import Scene
-from compgs.training.run.loop import TrainingStatus
+from compgs.training.run.status import TrainingStatus
 from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 

@@ -54,14 +54,15 @@ def test_the_network_of_the_neighbours_learns_and_latents_do_not_learn_from_it(
     assert network is not None
     before = {name: p.detach().clone() for name, p in network.named_parameters()}
     trainer.step = 12  # the rate is in the loss
-    looks = trainer.look()
-    trainer.learn(looks)
+    now = trainer.now
+    looks = trainer.look(now)
+    trainer.learn(looks, now)
     gradients = trainer.model.references.grad
     assert gradients is not None and network.follow.grad is not None
     without = gradients.clone()
-    trainer.learn_neighbours(trainer.quantize(looks), looks)
+    trainer.latents.learn_neighbours(trainer.latents.quantize(looks, now), looks)
     assert torch.equal(without, trainer.model.references.grad)
-    trainer.update(looks, torch.zeros(()))
+    trainer.update(looks.views, torch.zeros(()))
     assert all(not torch.equal(p, before[name]) for name, p in network.named_parameters())
 
 

@@ -9,7 +9,7 @@ import torch
 from compgs.codec import decode, encode
 from compgs.config import Config
 from compgs.scene.views import Scene
-from compgs.training.run.checkpoint import load_checkpoint
+from compgs.training.run.model_checkpoint import load_checkpoint
 from compgs.training.trainer import Trainer, train
 
 

@@ -11,7 +11,7 @@ import compgs
 from compgs.config import Config
 from compgs.scene.views import Scene
 from compgs.training.plan import head_bits
-from compgs.training.run.checkpoint import load_checkpoint
+from compgs.training.run.model_checkpoint import load_checkpoint
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -70,9 +70,9 @@ def test_bits_are_settled_once_the_networks_compute_with_them(blob_scene: Scene,
     trainer = Trainer(blob_scene, of_lambda(priced, 1e-9), CPU)
     assert trainer.model.head_bits == 7
     trainer.rate = replace(trainer.rate, lmbda=1.0)
-    trainer.choose_head_bits()
+    trainer.structure.follow(trainer.step, trainer.rate, stored=trainer.now.stored)
     assert trainer.model.head_bits == 5
     trainer.step = int(priced.training.quantized_weights * priced.training.steps)
     trainer.rate = replace(trainer.rate, lmbda=1e-9)
-    trainer.choose_head_bits()
+    trainer.structure.follow(trainer.step, trainer.rate, stored=trainer.now.stored)
     assert trainer.model.head_bits == 5

@@ -90,8 +90,8 @@ def test_latents_are_quantized_and_their_bits_counted_once_for_all_views(
     quantized = trainer.model.quantized
     expected = set()
     for view in trainer.views.order:
-        expected |= set(trainer.visible_anchors(trainer.scene.train_views[view].camera).tolist())
-    assert trainer.bounds.measured is not None, "asking for it is over"
+        expected |= set(trainer.survey.visible_anchors(trainer.scene.train_views[view].camera).tolist())
+    assert trainer.survey.bounds.measured is not None, "asking for it is over"
     monkeypatch.setattr(
         trainer.model, "quantized", lambda rows, **how: asked.append(rows.tolist()) or quantized(rows, **how)
     )

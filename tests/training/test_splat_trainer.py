@@ -16,7 +16,7 @@ from compgs.tensors.rasterize import rasterize
 from compgs.tensors.splats import Splats
 from compgs.tensors.ssim import ssim
 from compgs.training import SplatTrainer, Trainer, train_splats
-from compgs.training.run.checkpoint import load_checkpoint
+from compgs.training.run.model_checkpoint import load_checkpoint
 from compgs.training.splats.densification import DensifySchedule
 from compgs.training.splats.parameters import initial_splats
 

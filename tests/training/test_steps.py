@@ -167,7 +167,7 @@ def test_adam_moves_anchors_out_of_view_on(blob_scene: Scene, tiny_config: Confi
         model.log_scales -= 2.0  # so that they reach less far
     trainer.train_step()
     unseen = torch.ones(model.anchors, dtype=torch.bool)
-    unseen[trainer.visible_anchors(narrow.camera)] = False
+    unseen[trainer.survey.visible_anchors(narrow.camera)] = False
     assert 0 < unseen.sum() < model.anchors
     before = {name: getattr(model, name).detach().clone() for name in model.anchor_parameters}
     trainer.train_step()

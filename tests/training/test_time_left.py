@@ -9,7 +9,8 @@ import torch
 from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.scene.views import Scene
-from compgs.training.run.loop import Pace, TrainingStatus
+from compgs.training.run.pace import Pace
+from compgs.training.run.status import TrainingStatus
 from compgs.training.run.time_left import TimeLeft, drawing_seconds
 from compgs.training.shortcuts.coarse import halved, halvings, usual_camera
 from compgs.training.trainer import Trainer

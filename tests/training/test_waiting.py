@@ -11,11 +11,11 @@ import torch
 
 from compgs.config import Config
 from compgs.entropy.neighbourhood import neighbourhood
-from compgs.render import RasterResult
+from compgs.render import RasterResult, RasterSettings
 from compgs.tensors import where
 from compgs.tensors.visibility import visible_mask
-from compgs.training import trainer as trainer_module
-from compgs.training.run import loop as loop_module
+from compgs.training.step import pictures
+from compgs.training.survey import Survey
 from compgs.training.trainer import Trainer
 
 META = torch.device("meta")
@@ -41,8 +41,8 @@ def valueless_trainer(scene, config: Config, monkeypatch) -> Trainer:
         setattr(trainer.control, name, getattr(trainer.control, name).to(META))
     trainer.optimizer = torch.optim.SGD(trainer.optimizer.param_groups, lr=1e-3)
     rows = torch.arange(trainer.model.anchors // 2, device=META)
-    monkeypatch.setattr(Trainer, "visible_anchors", lambda self, camera: rows)
-    monkeypatch.setattr(loop_module, "rasterize", rasterize_nothing)
+    monkeypatch.setattr(Survey, "visible_anchors", lambda self, camera: rows)
+    monkeypatch.setattr(pictures, "rasterize", rasterize_nothing)
     return trainer
 
 
@@ -66,9 +66,7 @@ def test_choosing_among_primitives_would_need_values(blob_scene, tiny_config, mo
 
 def test_culling_needs_no_values(blob_scene):
     camera = blob_scene.train_views[0].camera
-    mask = visible_mask(
-        torch.zeros(7, 3, device=META), torch.zeros(7, device=META), camera, trainer_module.RasterSettings()
-    )
+    mask = visible_mask(torch.zeros(7, 3, device=META), torch.zeros(7, device=META), camera, RasterSettings())
     assert mask.shape == (7,)
 
 

@@ -13,7 +13,7 @@ from compgs.config import Config
 from compgs.methods import train
 from compgs.metrics import to_8bit
 from compgs.scene.views import Scene
-from compgs.training.run.loop import Trains
+from compgs.training.run.trains import Trains
 from compgs.viewer.shown import GrowingShown
 from compgs.viewer.stage import SpareTime
 from compgs.viewer.visitor import Look, Picture, Visitor, lens_of

@@ -41,7 +41,7 @@ def planned(settings: RunSettings, scene: "Scene", device: str | None, tiles: in
     if settings.method != PLANNED or settings.plan is not None:
         return settings
     from compgs.training import plan_for
-    from compgs.training.run.loop import chosen_device
+    from compgs.training.run.run import chosen_device
 
     if settings.tiles is not None and tiles == 1:
         tiles = tiles_of(settings.tiles, scene)

@@ -15,7 +15,7 @@ def among_ranks(device: str | None) -> Iterator[bool]:
     The others say nothing, but what goes wrong, and on which rank.
     """
     from compgs.training.run.distributed import joined, launched_rank
-    from compgs.training.run.loop import chosen_device
+    from compgs.training.run.run import chosen_device
 
     rank = launched_rank()
     if rank == 0:

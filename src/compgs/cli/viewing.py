@@ -11,7 +11,8 @@ from compgs.cli.usage import UsageError, check_range
 
 if TYPE_CHECKING:
     from compgs.scene import Scene
-    from compgs.training.run.loop import TrainingStatus, Trains
+    from compgs.training.run.status import TrainingStatus
+    from compgs.training.run.trains import Trains
     from compgs.viewer.live import LiveViewer
     from compgs.viewer.shown import GrowingShown, Shown
     from compgs.viewer.stage import SpareTime, Stage

@@ -39,7 +39,7 @@ from compgs.progress import shown_training
 from compgs.scene.views import Scene
 from compgs.training import Plan, TrainingStatus, plan_for
 from compgs.training.run.checkpoint import CHECKPOINT_NAME
-from compgs.training.run.loop import chosen_device as training_device
+from compgs.training.run.run import chosen_device as training_device
 
 SPLATS_PER_ANCHOR = 4.0  # at the start; growth adds anchors, pruning removes them
 HELD_OUT_EVERY = 8  # of given cameras, by name: as scenes are split (`load_scene`)

@@ -10,7 +10,7 @@ from compgs.config import Config
 from compgs.methods import train
 from compgs.scene.views import Scene
 from compgs.training import TrainingStatus, plan_for
-from compgs.training.run.loop import chosen_device
+from compgs.training.run.run import chosen_device
 
 TRIED = 40  # steps; fewer where these alone would take much of the time
 LEAST_TRIED = 10  # steps

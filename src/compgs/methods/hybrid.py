@@ -10,11 +10,11 @@ if TYPE_CHECKING:
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
     from compgs.trained_model import TrainedModel
-    from compgs.training.run.loop import Run
+    from compgs.training.run.run import Run
 
 
 def _train(scene: "Scene", config: "Config", run: "Run", start: "SplatModel | None" = None) -> "TrainedModel":
-    from compgs.training.trainer import train_hybrid
+    from compgs.training.hybrid import train_hybrid
 
     return train_hybrid(scene, config, run)
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from compgs.model.splats import SplatModel
     from compgs.render.render_model import Renderable
     from compgs.scene.views import Scene
-    from compgs.training.run.loop import Run
+    from compgs.training.run.run import Run
 
 # Settings of plain 3DGS, which methods that build on it have, too.
 SPLAT_SETTINGS = (

@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
     from compgs.training.plan import Plan
-    from compgs.training.run.loop import TrainingStatus, Watch
     from compgs.training.run.profile import StepProfile
+    from compgs.training.run.status import TrainingStatus
+    from compgs.training.run.trains import Watch
 
 
 def method_of(name: str) -> Method:
@@ -82,7 +83,7 @@ def train(
     from compgs.model.splats import SplatModel
     from compgs.scene import as_scene
     from compgs.training.run.distributed import rank
-    from compgs.training.run.loop import Run
+    from compgs.training.run.run import Run
 
     known = method_of(method)
     changes = {"steps": steps, "lmbda": lmbda, "seed": seed}

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from compgs.config import Config
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.run.loop import Run
+    from compgs.training.run.run import Run
 
 
 def train_plain(

@@ -52,6 +52,13 @@ def plan_for(scene: Scene, config: Config, device: torch.device, tiles: int = 1)
     return planned if tiles == 1 else planned.with_the_points_at_hand()
 
 
+def plan_of(model: TrainedModel, scene: Scene, device: torch.device) -> Plan:
+    """The plan that a model was made by; one that was made without goes by the rules for its scene."""
+    if isinstance(model.plan, Plan):
+        return model.plan
+    return plan(model.config, start_of(scene, model.config, device, model.anchors))
+
+
 def initial_model(
     scene: Scene,
     config: Config,

@@ -1,6 +1,5 @@
 """Training of such anchors without rate; methods add theirs (`training/run/loop.py` has the loop)."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +7,8 @@ import torch
 from torch import Tensor
 
 from compgs.cameras import Camera
-from compgs.config import Config, config_from_dict
+from compgs.config import Config
 from compgs.errors import ConfigError
-from compgs.gaussians import Gaussians
-from compgs.losses import Target, photometric_loss, scale_regularizer, scale_unit
 from compgs.methods.anchors.model import AnchorModel, control_settings, initial_anchors
 from compgs.methods.anchors.prediction import AnchorValues, predict_anchors
 from compgs.methods.anchors.scene import Frame
@@ -21,32 +18,34 @@ from compgs.scene.views import Scene
 from compgs.scene.world import local_scene
 from compgs.tensors.prediction import Prediction, camera_center
 from compgs.tensors.visibility import visible_mask
-from compgs.training.optimizers import ADAM_EPSILON, DECAYS, set_learning_rates
-from compgs.training.run.checkpoint import (
-    Writer,
-    check_same_run,
-    read_checkpoint_file,
-    tensors_by_kind,
-    write_checkpoint_file,
-)
+from compgs.training.optimizers import ADAM_EPSILON
+from compgs.training.run.checkpoint import checkpoint_of
 from compgs.training.run.distributed import world
-from compgs.training.run.loop import Run, StepResult, rasterize_step, run_to_end
-from compgs.training.run.parts import Chance, Memory, Statistics
-from compgs.training.run.restoring import (
-    check_step,
-    check_tensor,
-    check_tensors,
-    finite,
-    restoring,
-)
-from compgs.training.run.seen_points import check_points_seen
-from compgs.training.shortcuts.coarse import usual_camera
-from compgs.training.step.views_in_turn import ViewsInTurn
+from compgs.training.run.restoring import check_tensor, check_tensors, finite, restoring
+from compgs.training.run.run import Run
+from compgs.training.run.scene_trainer import SceneTrainer
+from compgs.training.run.status import StepResult, nothing_shown
+from compgs.training.step.pictures import Pictures, vanishing_loss, volume_loss
+from compgs.training.step.profiled import stations
 from compgs.training.structure.control import AdaptiveControl, make_schedule
-from compgs.training.trainer import stations, vanishing_loss
+
+# What a profile calls the parts of a step: methods of the trainer and of what it has.
+PARTS = {
+    "values": "quantization and entropy",
+    "visible_anchors": "culling",
+    "predict": "prediction",
+    "pictures.rasterize": "projection and rasterization",
+    "pictures.compare": "loss",
+    "regularize": "loss",
+    "added": "quantization and entropy",
+    "pictures.backward": "prediction and entropy, backward",
+    "update": "optimizer",
+    "observe": "control",
+    "finish_step": "control",
+}
 
 
-class AnchorTrainer:
+class AnchorTrainer(SceneTrainer):
     """State of a run: model, optimizer, control, and the order in which views come, one a step.
 
         values ──predict──► Gaussians ──rasterize──► image ──compare, + added──► loss ──► step ──► finish_step
@@ -55,7 +54,9 @@ class AnchorTrainer:
     `groups`), what `values` it is seen with, what is `added` to the loss, and what else is due after a step.
     """
 
-    kind = "anchors"  # what a progress display counts
+    kind = "anchors"
+    PROFILED = PARTS
+    stations = staticmethod(stations)
     kind_of_model: type[AnchorModel] = AnchorModel
 
     def __init__(
@@ -72,20 +73,16 @@ class AnchorTrainer:
                 f"method {method} trains in one process, with one view a step; found {world()} and "
                 f"{t.views_per_step}: start it without torchrun, and without training.views_per_step"
             )
-        self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure)
-        self.config = config
-        self.device = device
-        self.method = method
-        self.model = (model or initial_anchors(self.kind_of_model, scene, config)).to(device)
+        super().__init__(scene, config, device, method)
+        self.model = self.trained = (model or initial_anchors(self.kind_of_model, scene, config)).to(device)
         self.scene = local_scene(scene, self.model.frame.world_offset)
         groups = [{"name": n, "params": p, "lr": r[0], "rates": r} for n, (p, r) in self.groups().items()]
         self.optimizer = torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
         self.schedule = make_schedule(config.control, t.steps, len(scene.train_views))
         shape = self.model.anchors, config.model.coupled_primitives
         self.control = AdaptiveControl(control_settings(config), self.schedule, shape, device)
-        self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
         self.settings = RasterSettings(background=scene.background)
-        self.step = 0
+        self.pictures = Pictures(self.settings, t.ssim_weight)
 
     def groups(self) -> dict[str, tuple[list[Tensor], tuple[float, float]]]:
         """Parameters with their first and last learning rate, by a name."""
@@ -99,18 +96,8 @@ class AnchorTrainer:
         }
 
     @property
-    def progress(self) -> float:
-        """Return the fraction of the run that is done, 0 to 1."""
-        return self.step / self.config.training.steps
-
-    @property
     def primitives(self) -> int:
         return self.model.anchors
-
-    @property
-    def lmbda(self) -> float | None:
-        """Weight of the rate, where there is one."""
-        return None
 
     # one step ------------------------------------------------------------------------------------------------------
 
@@ -121,14 +108,15 @@ class AnchorTrainer:
         values = self.values()
         rows = self.visible_anchors(values, camera)
         if len(rows) == 0:
-            return self.skip(photograph)
+            self.finish_step()
+            return nothing_shown(photograph, self.scene.background, self.device)
         prediction = self.predict(values.rows(rows), camera)
-        rendered = self.rasterize(prediction.gaussians, camera)
-        loss = self.compare(rendered, photograph) + self.regularize(prediction, camera)
+        rendered = self.pictures.rasterize(prediction.gaussians, camera, watched=self.watched)
+        loss = self.pictures.compare(rendered, photograph) + self.regularize(prediction, camera)
         added = self.added()
         loss = loss if added is None else loss + added
-        self.backward(loss, rendered, prediction.gaussians)
-        self.update(index)
+        self.pictures.backward(loss, rendered, prediction.gaussians)
+        self.update([index], loss.detach())
         self.observe(rows, prediction, rendered, camera)
         self.finish_step()
         return StepResult(loss.detach(), rendered.image.detach(), photograph)
@@ -154,38 +142,18 @@ class AnchorTrainer:
     def predict(self, values: AnchorValues, camera: Camera) -> Prediction:
         return predict_anchors(self.weights(), values, camera_center(camera, self.device), self.model.frame)
 
-    def rasterize(self, gaussians: Gaussians, camera: Camera) -> RasterResult:
-        return rasterize_step(gaussians, camera, self.settings, watched=self.schedule.active(self.step))
-
-    def compare(self, rendered: RasterResult, target: Target) -> Tensor:
-        return photometric_loss(rendered.image, target, self.config.training.ssim_weight)
-
     def regularize(self, prediction: Prediction, camera: Camera) -> Tensor:
         """Penalties on large primitives and on a vanishing scene."""
-        gaussians = prediction.gaussians
-        unit = scale_unit(gaussians.means, camera_center(camera, self.device), self.scene.extent)
-        volumes = scale_regularizer(gaussians.scales / unit, prediction.drawn)
+        volumes = volume_loss(prediction, prediction.gaussians, camera, self.scene.extent)
         return self.config.training.scale_weight * volumes + self.vanishing(prediction)
 
     def vanishing(self, prediction: Prediction) -> Tensor | float:
         """Keeps a scene of which hardly anything is drawn from vanishing."""
         return vanishing_loss(prediction)
 
-    def backward(self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians) -> None:
-        """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
-        loss.backward()
-
-    def update(self, view: int) -> None:
-        t = self.config.training
-        exposures = self.views.exposure_gradients([view])
-        set_learning_rates(self.optimizer, self.progress, DECAYS[t.schedule], t.head_warm_up)
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-        self.views.learn(self.progress, [view], exposures)
-
     def observe(self, rows: Tensor, prediction: Prediction, rendered: RasterResult, camera: Camera) -> None:
         """The statistics that growth and pruning go by."""
-        if self.schedule.active(self.step) and rendered.means2d.grad is not None:
+        if self.watched and rendered.means2d.grad is not None:
             self.control.observe(rows, prediction, rendered.means2d.grad, camera)
 
     def finish_step(self) -> None:
@@ -196,23 +164,7 @@ class AnchorTrainer:
             self.control.act(self.model, self.optimizer, means, self.chance, 0.0)
         self.step += 1
 
-    def skip(self, photograph: Target) -> StepResult:
-        """A step on a view that no anchor is in: nothing can be learned from it."""
-        self.finish_step()
-        background = torch.tensor(self.scene.background, device=self.device)
-        return StepResult(torch.zeros(()), background.expand(*photograph.image.shape), photograph)
-
-    # the run -------------------------------------------------------------------------------------------------------
-
-    def run(self, run: Run) -> None:
-        """All remaining steps."""
-        check_points_seen(self.scene, self.settings.near_plane)
-        run_to_end(self, self.config.training, run.checkpoint, run.on_progress, run.watch)
-
-    def camera_at(self, step: int, divisor: int = 1) -> Camera:
-        """Return the camera of a usual training view, as large as a step looks at it."""
-        camera = usual_camera([view.camera for view in self.scene.train_views], divisor)
-        return camera
+    # what others ask -----------------------------------------------------------------------------------------------
 
     def snapshot(self) -> Renderable:
         return self.model.as_hybrid_model()
@@ -221,58 +173,19 @@ class AnchorTrainer:
         """Count the bytes of all numbers in single precision."""
         return 4 * sum(p.numel() for p in self.model.parameters())
 
-    def finish(self) -> None:
-        """Nothing is left to do."""
-
-    # checkpoints ---------------------------------------------------------------------------------------------------
-
-    def save(self, path: Path | None, writer: Writer | None = None) -> None:
-        assert path is not None, "it trains in one process"
-        memory = self.memory
-        tensors = {f"model/{name}": value for name, value in self.model.state_dict().items()}
-        tensors |= {f"optimizer/{name}": value for name, value in memory.moments().items()}
-        tensors |= {f"extra/{name}": value for name, value in memory.tensors().items()}
-        state = {"step": self.step, **memory.state(), **self.more_state()}
-        frame = {name: value for name, value in vars(self.model.frame).items()}
-        metadata = {
-            "config": json.dumps(self.config.to_dict()),
-            "frame": json.dumps(frame),
-            "state": json.dumps(state),
-        }
-        write_checkpoint_file(path, self.method, tensors, metadata, writer, device=self.device)
-
-    @property
-    def memory(self) -> Memory:
-        """What the run remembers between two steps, but for the model and the step."""
-        statistics = Statistics(self.control, AdaptiveControl.STATISTICS)
-        parts = (statistics, Chance(self.chance), self.views)
-        return Memory(lambda: dict(self.model.named_parameters()), self.optimizer, parts)
-
-    def more_state(self) -> dict[str, Any]:
-        """What else a checkpoint says, as JSON takes it."""
-        return {}
-
-    def restore_state(self, state: dict[str, Any]) -> None:
-        """Inverse of `more_state`. Raises ValueError and the like."""
+    def described(self) -> dict[str, Any]:
+        return {"frame": dict(vars(self.model.frame))}
 
     @classmethod
     def resumed(
         cls, scene: Scene, path: Path, config: Config, device: torch.device, method: str
     ) -> "AnchorTrainer":
         """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
-        tensors, metadata = read_checkpoint_file(path, method, device)
+        saved = checkpoint_of(path, method, config, scene, device)
         with restoring(path):
-            state = json.loads(metadata["state"])
-            saved = config_from_dict(json.loads(metadata["config"]), str(path), type(config))
-            check_same_run(saved, config, state["views"], scene)
-            check_step(state, config.training.steps)
-            parts = tensors_by_kind(tensors)
-            model = cls._model(config, json.loads(metadata["frame"]), parts["model"])
+            model = cls._model(config, saved.described["frame"], saved.model)
         trainer = cls(scene, config, device, method, model)
-        with restoring(path):
-            trainer.memory.restore(parts["optimizer"], parts["extra"], state)
-            trainer.restore_state(state)
-            trainer.step = state["step"]
+        trainer.go_on(path, saved)
         return trainer
 
     @classmethod
@@ -303,23 +216,5 @@ def train_anchors(kind: type[AnchorTrainer], scene: Scene, config: Config, run: 
         trainer = kind.resumed(scene, run.earlier, config, run.device, run.method)
     else:
         trainer = kind(scene, config, run.device, run.method)
-    if run.profile is not None:
-        run.profile.watch(trainer, PARTS, stations)
-    trainer.run(run)
+    trainer.carry_out(run)
     return trainer.model
-
-
-# What a profile calls the parts of a step.
-PARTS = {
-    "values": "quantization and entropy",
-    "visible_anchors": "culling",
-    "predict": "prediction",
-    "rasterize": "projection and rasterization",
-    "compare": "loss",
-    "regularize": "loss",
-    "added": "quantization and entropy",
-    "backward": "prediction and entropy, backward",
-    "update": "optimizer",
-    "observe": "control",
-    "finish_step": "control",
-}

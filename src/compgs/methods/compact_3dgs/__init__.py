@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from compgs.methods.parts.content import Content
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.run.loop import Run
+    from compgs.training.run.run import Run
 
 MOST_LEVELS, MOST_FEATURES, MOST_CELLS, MOST_TABLE_BITS = 32, 8, 1 << 14, 24
 

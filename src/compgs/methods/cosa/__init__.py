@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from compgs.methods.cosa.model import CosaModel
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.run.loop import Run
+    from compgs.training.run.run import Run
 
 
 def _train(scene: "Scene", config: CosaConfig, run: "Run", start: "SplatModel | None" = None) -> "CosaModel":

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from compgs.methods.anchors.scene import AnchorScene
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.run.loop import Run
+    from compgs.training.run.run import Run
 
 
 # What differs from the defaults of `compgs.config`, as in the authors' release; schedules as fractions of its 30 000

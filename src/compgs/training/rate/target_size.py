@@ -7,10 +7,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from compgs.errors import ConfigError, TrainingError
+from compgs.errors import ConfigError
 from compgs.trained_model import TrainedModel
 from compgs.training.rate.file_size import FileSize, anchor_bits, fixed_bytes
 from compgs.training.rate.rate_control import LOOKS, RateState, due, follow
+from compgs.training.run.divergence import diverged
 from compgs.training.structure.control import ControlSchedule
 from compgs.training.structure.importance import missed
 from compgs.training.structure.pruning import paying
@@ -59,7 +60,7 @@ class TargetSize:
         grown = self.schedule.ended(step)
         size, fixed = self.size(), fixed_bytes(self.model)
         if not math.isfinite(size):
-            raise TrainingError(f"step {step}: the rate is {size}; try a lower learning rate or another seed")
+            raise diverged(step, "rate", size)
         pruned = any(step - t.steps // LOOKS <= at < step for at in self.pruned_at)
         if pruned or step % max(1, t.steps // SHARES) == 0 or (grown and state.error is None):
             share = self.lasting_share(state.lmbda_of_pruning, step)
@@ -88,6 +89,15 @@ class TargetSize:
         """
         found = self.file.latents(mask)
         return math.floor(found) if math.isfinite(found) else found
+
+    def estimated_bytes(self, written: float, step: int) -> int:
+        """Bytes of the whole file if it were written now, at a step; `written`: as in `bits_that_stay`. Raises
+        TrainingError if the latents are not finite any more.
+        """
+        size = written * self.file.latents()
+        if not math.isfinite(size):
+            raise diverged(step, "rate", size)
+        return int(size) + fixed_bytes(self.model)
 
     def lasting_share(self, lmbda: float, step: int) -> float:
         """Predicted share of the bytes of `size` that is left at the end of the run, after the last pruning."""

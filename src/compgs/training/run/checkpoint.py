@@ -5,51 +5,38 @@ Tensors by name; settings, counters and the view order as JSON in the file's met
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
-import numpy as np
 import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor
 
-from compgs.cameras import Camera
 from compgs.config import Config, config_from_dict
 from compgs.errors import CheckpointError, OutputError
 from compgs.outputs import replacing
-from compgs.scene.capture import check_camera
-from compgs.scene.points import COORDINATE_BITS
 from compgs.scene.views import Scene
-from compgs.stored_weights import MOST_BITS
-from compgs.trained_model import TrainedModel
-from compgs.training.plan import Plan
-from compgs.training.run.restoring import (
-    check_moments,
-    check_step,
-    check_tensor,
-    check_tensors,
-    finite,
-    restoring,
-    whole_number,
-)
+from compgs.training.run.restoring import check_step, restoring
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 CHECKPOINT_VERSION = "11"
+STAMP = ("format", "version", "method", "device")  # what every checkpoint says of itself
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """State of a run between two steps."""
+    """State of a run between two steps, of whatever kind."""
 
-    model: TrainedModel
-    plan: Plan
+    config: Config
+    model: dict[str, Tensor]  # what is trained
     optimizer: dict[str, Tensor]  # "<parameter name>/<moment>"
     extra: dict[str, Tensor]  # control statistics, random generators
     state: dict[str, Any]  # step, view order, ... (JSON)
+    described: dict[str, Any] = field(default_factory=dict)  # what else is to be known of the model (JSON)
 
 
 class Writer:
@@ -92,32 +79,45 @@ class Writer:
             self._error = error
 
 
-def save_checkpoint(path: Path, checkpoint: Checkpoint, writer: Writer | None = None) -> None:
-    """Raises OutputError if the file cannot be written; a previous checkpoint then stays as it was. With a `writer`
-    that happens later, and what is saved may change meanwhile.
+def write_checkpoint(
+    path: Path, method: str, checkpoint: Checkpoint, writer: Writer | None = None, *, device: torch.device
+) -> None:
+    """Write the checkpoint of a method's run on a device; a previous one stays as it was until then. With a `writer`
+    that happens later, and what is saved may change meanwhile. Raises OutputError if the file cannot be written.
     """
-    model = checkpoint.model
-    tensors = {f"model/{k}": v for k, v in model.state_dict().items()}
-    tensors |= {f"optimizer/{k}": v for k, v in checkpoint.optimizer.items()}
-    tensors |= {f"extra/{k}": v for k, v in checkpoint.extra.items()}
-    metadata = {
-        "config": json.dumps(model.config.to_dict()),
-        "scene": json.dumps(
-            {
-                "voxel_size": model.voxel_size,
-                "distance_unit": model.distance_unit,
-                "background": list(model.background),
-                "viewpoints": [_camera_entry(camera) for camera in model.viewpoints],
-                "up": list(model.up),
-                "angular_dilation": model.angular_dilation,
-                "world_offset": list(model.world_offset),
-                "head_bits": model.head_bits,
-            }
-        ),
-        "plan": json.dumps(checkpoint.plan.to_dict()),
-        "state": json.dumps(checkpoint.state),
-    }
-    write_checkpoint_file(path, "compgs", tensors, metadata, writer, device=model.device)
+    tensors = {f"model/{name}": value for name, value in checkpoint.model.items()}
+    tensors |= {f"optimizer/{name}": value for name, value in checkpoint.optimizer.items()}
+    tensors |= {f"extra/{name}": value for name, value in checkpoint.extra.items()}
+    told = {"config": checkpoint.config.to_dict(), **checkpoint.described, "state": checkpoint.state}
+    metadata = {name: json.dumps(value) for name, value in told.items()}
+    write_checkpoint_file(path, method, tensors, metadata, writer, device=device)
+
+
+def read_checkpoint(
+    path: Path, method: str, kind: type[Config], device: torch.device | None = None
+) -> Checkpoint:
+    """Inverse of `write_checkpoint`, to go on with it on a `device` if one is given; `kind` of settings.
+
+    Raises CheckpointError if there is none, or it is damaged, of another version, method or kind of device.
+    """
+    tensors, metadata = read_checkpoint_file(path, method, device)
+    with restoring(path):
+        told = {name: json.loads(value) for name, value in metadata.items() if name not in STAMP}
+        config = config_from_dict(told.pop("config"), str(path), kind)
+        state = told.pop("state")
+        check_step(state, config.training.steps)
+        parts = tensors_by_kind(tensors)
+        return Checkpoint(config, parts["model"], parts["optimizer"], parts["extra"], state, told)
+
+
+def checkpoint_of(path: Path, method: str, config: Config, scene: Scene, device: torch.device) -> Checkpoint:
+    """Read the checkpoint of a run with these settings on this scene. Raises CheckpointError, also where it is another
+    run's.
+    """
+    saved = read_checkpoint(path, method, type(config), device)
+    with restoring(path):
+        check_same_run(saved.config, config, saved.state["views"], scene)
+    return saved
 
 
 def write_checkpoint_file(
@@ -130,10 +130,9 @@ def write_checkpoint_file(
     device: torch.device,
 ) -> None:
     """Tensors by name and JSON texts by name, of a method's run on a device. Raises OutputError; see
-    `save_checkpoint`.
+    `write_checkpoint`.
     """
-    stamp = {"format": "compgs checkpoint", "version": CHECKPOINT_VERSION, "method": method}
-    stamp["device"] = device.type
+    stamp = dict(zip(STAMP, ("compgs checkpoint", CHECKPOINT_VERSION, method, device.type), strict=True))
     copy = writer is not None
     content = {k: v.detach().to("cpu", copy=copy).contiguous() for k, v in tensors.items()}
     write = partial(_write, path, content, metadata | stamp)
@@ -151,78 +150,10 @@ def _write(path: Path, content: dict[str, Tensor], metadata: dict[str, str]) -> 
         raise OutputError(f"{path}: the checkpoint cannot be written ({error})") from error
 
 
-def load_checkpoint(path: Path, device: torch.device | None = None) -> Checkpoint:
-    """Read a checkpoint, to go on with it on a `device` if one is given.
-
-    Raises CheckpointError if there is none, or it is damaged, of another version, method or kind of device.
-    """
-    tensors, metadata = read_checkpoint_file(path, "compgs", device)
-    with restoring(path):
-        config = config_from_dict(json.loads(metadata["config"]), str(path))
-        parts = tensors_by_kind(tensors)
-        plan = Plan.from_dict(json.loads(metadata["plan"]))
-        model = _model(config, plan, json.loads(metadata["scene"]), parts["model"])
-        check_moments(parts["optimizer"], dict(model.named_parameters()))
-        state = json.loads(metadata["state"])
-        check_step(state, config.training.steps)
-        return Checkpoint(model, plan, parts["optimizer"], parts["extra"], state)
-
-
-def _model(config: Config, plan: Plan, scene: dict[str, Any], tensors: dict[str, Tensor]) -> TrainedModel:
-    """Raises ValueError and the like for what does not belong together."""
-    coordinates, references = tensors["coordinates"], tensors["references"]
-    anchors = len(coordinates)
-    check_tensor(coordinates, (anchors, 3), torch.int32, "coordinates")
-    if anchors == 0 or coordinates.abs().max() >= 1 << (COORDINATE_BITS - 1):
-        raise ValueError(f"{anchors} anchors, expected some, at coordinates of {COORDINATE_BITS} bits")
-    # Of as many anchors as there are coordinates, before as much memory is taken.
-    for name, columns in (("log_scales", 6), ("mask", plan.coupled_primitives)):
-        if tensors[name].shape != (anchors, columns):
-            raise ValueError(f"{name}: expected {[anchors, columns]}, found {list(tensors[name].shape)}")
-    if references.shape != (anchors, references.shape[-1]) or not (
-        1 <= references.shape[1] <= config.model.reference_dim
-    ):
-        raise ValueError(f"references: {list(references.shape)} of {anchors} anchors")
-    (voxel_size, distance_unit) = finite([scene["voxel_size"], scene["distance_unit"]], 2, "units", above=0.0)
-    red, green, blue = finite(scene["background"], 3, "background")
-    x, y, z = finite(scene["world_offset"], 3, "world_offset")
-    model = TrainedModel(
-        config,
-        coordinates,
-        voxel_size,
-        distance_unit,
-        (red, green, blue),
-        (x, y, z),
-        plan,
-        references.shape[1],
-    )
-    if scene["angular_dilation"] is not None:
-        (model.angular_dilation,) = finite([scene["angular_dilation"]], 1, "angular_dilation", above=0.0)
-    model.head_bits = whole_number(scene["head_bits"], 1, MOST_BITS, "head_bits")
-    model.viewpoints = tuple(_camera(entry) for entry in scene["viewpoints"])
-    up_x, up_y, up_z = finite(scene["up"], 3, "up")
-    model.up = (up_x, up_y, up_z)
-    check_tensors(tensors, model.state_dict(), "model")
-    model.load_state_dict(tensors)
-    return model
-
-
-def _camera_entry(camera: Camera) -> dict[str, Any]:
-    return {**vars(camera), "world_to_camera": np.asarray(camera.world_to_camera, np.float64).tolist()}
-
-
-def _camera(entry: dict[str, Any]) -> Camera:
-    camera = Camera(**{**entry, "world_to_camera": np.array(entry["world_to_camera"], np.float64)})
-    if camera.world_to_camera.shape != (4, 4):
-        raise ValueError(f"a camera's pose of {list(camera.world_to_camera.shape)} numbers, expected 4 x 4")
-    check_camera(camera, "a camera that the file would keep")
-    return camera
-
-
 def read_checkpoint_file(
     path: Path, method: str, device: torch.device | None = None
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Inverse of `write_checkpoint_file`. Raises CheckpointError, as `load_checkpoint`."""
+    """Inverse of `write_checkpoint_file`. Raises CheckpointError, as `read_checkpoint`."""
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint; start the run without resuming")
     try:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Any
 
-from compgs.training.run.loop import TrainingStatus
+from compgs.training.run.status import TrainingStatus
 
 MOST_POINTS = 200
 # Of a training view each, and so different from report to report: a point has their mean.

@@ -58,10 +58,11 @@ class Memory:
         self, moments: dict[str, Tensor], tensors: Mapping[str, Tensor], state: Mapping[str, Any]
     ) -> None:
         """Inverse of the other three. Raises ValueError and the like for what does not fit."""
-        check_moments(moments, self.parameters())
-        restore_optimizer(self.parameters(), self.optimizer, moments)
         for part in self.parts:
             part.restore(tensors, state)
+        # Some parts have parameters of their own.
+        check_moments(moments, self.parameters())
+        restore_optimizer(self.parameters(), self.optimizer, moments)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import functools
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
+from operator import attrgetter
 from typing import Any
 
 import torch
@@ -35,12 +36,16 @@ class StepProfile:
         self._inside = False
 
     def watch(self, trainer: Any, parts: Mapping[str, str], stations: Stations) -> None:
-        """Wrap a trainer's methods: `parts` names what each of them is; `train_step` is the whole, `backward` the
-        backward pass, whose arguments `stations` takes.
+        """Wrap methods of a trainer, or of what it has (`pictures.compare`): `parts` names what each of them is;
+        `train_step` is the whole, the one called `backward` the backward pass, whose arguments `stations` takes.
         """
-        for method, part in parts.items():
-            setattr(trainer, method, self._timed(getattr(trainer, method), part))
-        backward, step = trainer.backward, trainer.train_step
+        owner = trainer  # of the backward pass
+        for path, part in parts.items():
+            place, _, method = path.rpartition(".")
+            whose = attrgetter(place)(trainer) if place else trainer
+            setattr(whose, method, self._timed(getattr(whose, method), part))
+            owner = whose if method == "backward" else owner
+        backward, step = owner.backward, trainer.train_step
 
         @functools.wraps(backward)
         def watched_backward(*arguments: Any) -> Any:
@@ -56,7 +61,7 @@ class StepProfile:
             self.steps += self._seen > self.warm_up
             return result
 
-        trainer.backward, trainer.train_step = watched_backward, watched_step
+        owner.backward, trainer.train_step = watched_backward, watched_step
 
     def milliseconds(self) -> dict[str, float]:
         """Return the milliseconds of a step by part, in the order in which the parts come."""

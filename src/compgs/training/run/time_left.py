@@ -20,7 +20,7 @@ from compgs.render.render_model import Renderable, settings_of
 from compgs.tensors.rasterize import rasterize
 
 if TYPE_CHECKING:
-    from compgs.training.run.loop import Trains
+    from compgs.training.run.trains import Trains
 
 POINTS = 200  # steps of a run, evenly spaced, that stand for all
 MOST_SIZES = 6  # that are drawn at once

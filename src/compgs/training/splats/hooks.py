@@ -7,9 +7,9 @@ A hook's own parameters (codebooks, masks, decoders) are those of a `torch.nn.Mo
 `rates` they name, and checkpoints keep them with its buffers.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor, nn
 
@@ -21,6 +21,9 @@ from compgs.tensors.splats import Splats
 
 if TYPE_CHECKING:
     from compgs.training.splats.trainer import SplatTrainer
+
+
+HOOKS = "hooks/"  # before the names of the hooks' parameters, in checkpoints and in the optimizer
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,28 @@ def restore_hooks(hooks: Hooks, tensors: Mapping[str, Tensor]) -> None:
             setattr(module, attribute, nn.Parameter(value))
         else:
             module.register_buffer(attribute, value)
+
+
+@dataclass(frozen=True)
+class HookState:
+    """The parameters and buffers of hooks, as a run remembers them."""
+
+    hooks: Hooks
+    restored: Callable[[], None]  # called when they are back
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All of them, for a checkpoint."""
+        return {HOOKS + name: value for name, value in hook_state(self.hooks).items()}
+
+    def state(self) -> dict[str, Any]:
+        """Nothing beside the tensors."""
+        return {}
+
+    def restore(self, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
+        """Inverse of `tensors`. Raises ValueError and the like."""
+        own = {name.removeprefix(HOOKS): v for name, v in tensors.items() if name.startswith(HOOKS)}
+        restore_hooks(self.hooks, own)
+        self.restored()
 
 
 def parameter_groups(hooks: Hooks) -> dict[str, list[nn.Parameter]]:

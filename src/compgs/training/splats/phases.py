@@ -6,15 +6,21 @@ A checkpoint says in which phase it was written. A phase begins with the splats 
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
 
 from compgs.config import Config
 from compgs.model.splats import SplatModel
+from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.training.run.checkpoint import read_checkpoint_file
-from compgs.training.run.loop import Run, TrainingStatus
+from compgs.training.run.profile import StepProfile
 from compgs.training.run.restoring import restoring
+from compgs.training.run.run import Run, chosen_config
+from compgs.training.run.status import TrainingStatus
 from compgs.training.splats.hooks import Hooks
-from compgs.training.splats.trainer import PARTS, SplatTrainer, stations
+from compgs.training.splats.trainer import METHOD, SplatTrainer
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,28 @@ def fine_tuning(config: Config, steps: int) -> Config:
         training=replace(config.training, steps=steps),
         splats=replace(config.splats, densify_stop=0.0, harmonics_every=0.0, position_lr=(last, last)),
     )
+
+
+def train_splats(
+    scene: Scene | str | Path,
+    config: Config | None = None,
+    *,
+    preset: str | None = None,
+    output: str | Path | None = None,
+    resume: bool = False,
+    progress: Callable[[TrainingStatus], None] | None = None,
+    device: str | torch.device | None = None,
+    profile: StepProfile | None = None,
+) -> SplatModel:
+    """Train plain 3DGS on a scene; the result is ready for `compgs.formats.write_ply`. Arguments as of `train`.
+
+    Of the settings, `splats` applies, and of `training` the steps, the seed, the loss and the checkpoints.
+
+    Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
+    """
+    config = chosen_config(config, preset)
+    run = Run(METHOD, output=output, resume=resume, on_progress=progress, device=device, profile=profile)
+    return train_phases(as_scene(scene), (Phase(config),), run).model()
 
 
 def train_phases(
@@ -65,10 +93,8 @@ def train_phases(
                 trainer.step = phase.config.training.steps
             else:
                 trainer.begin()
-        if run.profile is not None:
-            run.profile.watch(trainer, PARTS, stations)
         before = sum(phase.config.training.steps for phase in phases[:index])
-        trainer.run(run.checkpoint, _of_whole(run.on_progress, before, total), run.watch)
+        trainer.carry_out(run, _of_whole(run.on_progress, before, total))
     assert trainer is not None
     return trainer
 

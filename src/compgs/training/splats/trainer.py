@@ -6,56 +6,33 @@ Same scenes, views, rasterizer, loss and evaluation as the hybrid method's (`tra
 quantization, no rate. Methods that compress splats build on it by `training/splats/hooks.py`.
 """
 
-import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from compgs.cameras import Camera
-from compgs.config import Config, config_from_dict
+from compgs.config import Config
 from compgs.devices import placed
 from compgs.gaussians import Gaussians
-from compgs.losses import photometric_loss
 from compgs.model.splats import SplatModel
 from compgs.render import RasterResult, RasterSettings
-from compgs.scene import as_scene
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
 from compgs.tensors.visibility import visible_mask
-from compgs.training.optimizers import exponential_decay, parameters_of, rates_for, set_learning_rates
-from compgs.training.run.checkpoint import (
-    Writer,
-    check_same_run,
-    read_checkpoint_file,
-    tensors_by_kind,
-    write_checkpoint_file,
-)
-from compgs.training.run.distributed import check_identical, mine, sum_gradients, whole
-from compgs.training.run.loop import (
-    Run,
-    StepResult,
-    TrainingStatus,
-    Watch,
-    chosen_config,
-    rasterize_step,
-    run_to_end,
-)
-from compgs.training.run.parts import Chance, Memory, Statistics
-from compgs.training.run.profile import StepProfile
-from compgs.training.run.restoring import (
-    check_step,
-    check_tensor,
-    finite,
-    restoring,
-)
-from compgs.training.run.seen_points import check_points_seen
-from compgs.training.shortcuts.coarse import usual_camera
+from compgs.training.optimizers import exponential_decay, rates_for, set_learning_rates
+from compgs.training.run.checkpoint import checkpoint_of
+from compgs.training.run.distributed import mine, whole
+from compgs.training.run.parts import Part
+from compgs.training.run.restoring import check_tensor, finite, restoring
+from compgs.training.run.scene_trainer import SceneTrainer
+from compgs.training.run.status import StepResult
 from compgs.training.splats.densification import DensityControl, densify_schedule
-from compgs.training.splats.hooks import Drawn, Hooks, hook_state, parameter_groups, restore_hooks
+from compgs.training.splats.hooks import HOOKS, Drawn, Hooks, HookState, hook_state, parameter_groups
 from compgs.training.splats.parameters import (
     SplatParameters,
     initial_splats,
@@ -65,43 +42,40 @@ from compgs.training.splats.parameters import (
     replace_splats,
     reset_opacities,
 )
-from compgs.training.step.views_in_turn import ViewsInTurn
+from compgs.training.step.pictures import Pictures
 
 METHOD = "3dgs"
-HOOKS = "hooks/"  # before the names of the hooks' parameters, in checkpoints and in the optimizer
 # Numbers of a splat in a .ply file of degree 0: position, normal, color, opacity, scales, rotation.
 STORED_NUMBERS = 3 + 3 + 3 + 1 + 3 + 4
 
 
-def train_splats(
-    scene: Scene | str | Path,
-    config: Config | None = None,
-    *,
-    preset: str | None = None,
-    output: str | Path | None = None,
-    resume: bool = False,
-    progress: Callable[[TrainingStatus], None] | None = None,
-    device: str | torch.device | None = None,
-    profile: StepProfile | None = None,
-) -> SplatModel:
-    """Train plain 3DGS on a scene; the result is ready for `compgs.formats.write_ply`. Arguments as of `train`.
-
-    Of the settings, `splats` applies, and of `training` the steps, the seed, the loss and the checkpoints.
-
-    Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
-    """
-    from compgs.training.splats.phases import Phase, train_phases
-
-    config = chosen_config(config, preset)
-    run = Run(METHOD, output=output, resume=resume, on_progress=progress, device=device, profile=profile)
-    return train_phases(as_scene(scene), (Phase(config),), run).model()
+# What a profile calls the parts of a step: methods of the trainer and of what it has.
+PARTS = {
+    "inside": "culling",
+    "activate": "activation and harmonics",
+    "pictures.rasterize": "projection and rasterization",
+    "compare": "loss",
+    "pictures.backward": "activation and harmonics, backward",
+    "update": "optimizer",
+    "control_density": "density control",
+}
 
 
-class SplatTrainer:
+def stations(
+    loss: Tensor, rendered: RasterResult, gaussians: Gaussians
+) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
+    """Where the gradients of a step arrive. Autograd goes back through the projection, then through the harmonics."""
+    yield "loss, backward", (rendered.image,)
+    yield "rasterization, backward", (rendered.means2d,)
+    yield "projection, backward", (gaussians.colors,)
+
+
+class SplatTrainer(SceneTrainer):
     """State of a run: splats, optimizer, density control, and the order in which views come."""
 
     kind = "splats"
-    lmbda = None  # no rate in the loss
+    PROFILED = PARTS
+    stations = staticmethod(stations)
 
     def __init__(
         self,
@@ -114,28 +88,23 @@ class SplatTrainer:
         phase: int = 0,  # of the run, and the method whose run it is: checkpoints say them
         method: str = METHOD,
     ) -> None:
+        super().__init__(scene, config, device, method)
         t = config.training
-        per_step = t.views_per_step
-        self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure, per_step=per_step)
         self.world_offset = world_offset(scene) if start is None else start.world_offset
         scene = self.scene = local_scene(scene, self.world_offset)
-        self.config = config
-        self.device = device
         self.phase = phase
-        self.method = method
         self.hooks = (hooks or Hooks()).to(device)
         splats = (
             initial_splats(scene.points, config.splats)
             if start is None
             else of_degree(Splats.of(start.splats), config.splats.harmonics)
         )
-        self.parameters = SplatParameters(splats.to(device))
-        self.optimizer = make_splat_optimizer(self.parameters, config.splats, scene.extent, per_step)
-        self.schedule = densify_schedule(config.splats, t.steps, len(scene.train_views), per_step)
+        self.parameters = self.trained = SplatParameters(splats.to(device))
+        self.optimizer = make_splat_optimizer(self.parameters, config.splats, scene.extent, t.views_per_step)
+        self.schedule = densify_schedule(config.splats, t.steps, len(scene.train_views), t.views_per_step)
         self.control = DensityControl(config.splats, scene.extent, len(self.parameters), device)
-        self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of splits
         self.settings = RasterSettings(background=scene.background)
-        self.step = 0
+        self.pictures = Pictures(self.settings, t.ssim_weight)
 
     def begin(self) -> None:
         """Let the hooks make what depends on the splats: before the first step of a run that is not resumed."""
@@ -181,14 +150,9 @@ class SplatTrainer:
         """The gradients of a view."""
         drawn = self.draw(view)
         loss = self.compare(drawn)
-        self.backward(loss, drawn.rendered, drawn.gaussians)
+        self.pictures.backward(loss, drawn.rendered, drawn.gaussians)
         self.observe(drawn.rendered, drawn.camera)
         return StepResult(loss.detach(), drawn.rendered.image.detach(), drawn.photograph)
-
-    @property
-    def progress(self) -> float:
-        """Return the fraction of this phase that is done, 0 to 1."""
-        return self.step / self.config.training.steps
 
     def draw(self, index: int) -> Drawn:
         """A training view as the hooks want it looked at."""
@@ -196,7 +160,8 @@ class SplatTrainer:
         camera, photograph = self.hooks.view(self.scene.train_views[index].camera, photograph, self)
         splats = self.hooks.transform(self.parameters.splats(), self)
         gaussians = self.activate(splats, self.inside(splats, camera), camera)
-        return Drawn(camera, photograph, splats, gaussians, self.rasterize(gaussians, camera))
+        rendered = self.pictures.rasterize(gaussians, camera, watched=self.watched)
+        return Drawn(camera, photograph, splats, gaussians, rendered)
 
     def inside(self, splats: Splats, camera: Camera) -> Tensor:
         """[M] bool: splats that may be in the image."""
@@ -205,35 +170,23 @@ class SplatTrainer:
     def activate(self, splats: Splats, inside: Tensor, camera: Camera) -> Gaussians:
         return splat_gaussians(splats, camera, self.degree(), inside)
 
-    def rasterize(self, gaussians: Gaussians, camera: Camera) -> RasterResult:
-        return rasterize_step(gaussians, camera, self.settings, watched=self.schedule.active(self.step))
-
     def compare(self, drawn: Drawn) -> Tensor:
-        loss = photometric_loss(drawn.rendered.image, drawn.photograph, self.config.training.ssim_weight)
+        """[] by how much the picture differs from its photograph, and what the hooks add to that."""
+        loss = self.pictures.compare(drawn.rendered, drawn.photograph)
         added = self.hooks.loss(drawn, self)
         return loss if added is None else loss + added
 
-    def backward(self, loss: Tensor, rendered: RasterResult, gaussians: Gaussians) -> None:
-        """Compute the gradients. The arguments are the tensors at which a profile takes the time (`stations`)."""
-        loss.backward()
-
-    def update(self, views: Sequence[int], loss: Tensor) -> None:
-        """Adam's step after these views. Over the ranks gradients are summed, and the `loss` [], which becomes that of
-        all views.
-        """
-        exposures = self.views.exposure_gradients(views)
-        sum_gradients(parameters_of(self.optimizer), loss, *exposures)
+    def set_learning_rates(self) -> None:
+        """Give each group of parameters its learning rate of this step."""
         set_learning_rates(self.optimizer, self.progress, self.learning_rate)
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-        self.views.learn(self.progress, views, exposures)
 
     def learning_rate(self, first: float, last: float, progress: float) -> float:
         """Return the learning rate of a group, at some progress of the phase."""
         return exponential_decay(first, last * self.hooks.slowing, progress)
 
     def observe(self, rendered: RasterResult, camera: Camera) -> None:
-        if self.schedule.active(self.step) and rendered.means2d.grad is not None:
+        """Gather the statistics that density control goes by, where it watches the step."""
+        if self.watched and rendered.means2d.grad is not None:
             self.control.observe(rendered.means2d.grad, rendered.visible, camera)
 
     def control_density(self) -> None:
@@ -251,10 +204,10 @@ class SplatTrainer:
         if self.schedule.reset_due(self.step):
             reset_opacities(self.parameters, self.optimizer, self.config.splats.reset_opacity)
 
-    def check_ranks(self) -> None:
-        """Raises TrainingError if the ranks of a torchrun have come to hold different splats."""
+    def held_in_common(self) -> dict[str, Tensor]:
+        """Name what all ranks of a torchrun must hold alike: buffers of the hooks, too."""
         own = {HOOKS + name: value for name, value in hook_state(self.hooks).items()}
-        check_identical(self.step, {**self.named_parameters(), **own})
+        return {**self.named_parameters(), **own}
 
     @torch.no_grad()
     def as_drawn(self) -> Splats:
@@ -276,17 +229,6 @@ class SplatTrainer:
 
     # the run -------------------------------------------------------------------------------------------------------
 
-    def run(
-        self,
-        path: Path | None,
-        on_progress: Callable[[TrainingStatus], None] | None,
-        watch: Watch | None = None,
-    ) -> None:
-        """All remaining steps; a checkpoint at `path` every few minutes, at the end, and when interrupted."""
-        check_points_seen(self.scene, self.settings.near_plane)
-        self.check_ranks()
-        run_to_end(self, self.config.training, path, on_progress, watch)
-
     def estimated_bytes(self) -> int:
         """Size of the method's file if it were written now; of a .ply file without its header."""
         known = self.hooks.estimated_bytes(self)
@@ -300,8 +242,7 @@ class SplatTrainer:
 
     def camera_at(self, step: int, divisor: int = 1) -> Camera:
         """Return the camera of a usual training view, as large as a step looks at it."""
-        camera = usual_camera([view.camera for view in self.scene.train_views], divisor)
-        return self.hooks.sized(camera, step / self.config.training.steps)
+        return self.hooks.sized(super().camera_at(step, divisor), step / self.config.training.steps)
 
     def snapshot(self) -> SplatModel:
         """Return the splats before any `transform`, for which a hook may draw random numbers."""
@@ -314,30 +255,11 @@ class SplatTrainer:
 
     # checkpoints ---------------------------------------------------------------------------------------------------
 
-    def save(self, path: Path | None, writer: Writer | None = None) -> None:
-        with whole(self.control, DensityControl.STATISTICS):
-            if path is not None:
-                self.write(path, writer)
+    def state(self) -> dict[str, Any]:
+        return {"phase": self.phase, "world_offset": self.world_offset}
 
-    def write(self, path: Path, writer: Writer | None) -> None:
-        memory = self.memory
-        tensors = {f"model/{name}": p for name, p in vars(self.parameters.trained()).items()}
-        tensors |= {f"optimizer/{name}": value for name, value in memory.moments().items()}
-        tensors |= {f"extra/{name}": value for name, value in memory.tensors().items()}
-        tensors |= {f"extra/{HOOKS}{name}": value for name, value in hook_state(self.hooks).items()}
-        place = {"step": self.step, "phase": self.phase, "world_offset": self.world_offset}
-        metadata = {
-            "config": json.dumps(self.config.to_dict()),
-            "state": json.dumps({**place, **memory.state()}),
-        }
-        write_checkpoint_file(path, self.method, tensors, metadata, writer, device=self.device)
-
-    @property
-    def memory(self) -> Memory:
-        """What the run remembers between two steps, but for the splats, the hooks and the step."""
-        statistics = Statistics(self.control, DensityControl.STATISTICS)
-        parts = (statistics, Chance(self.chance), self.views)
-        return Memory(self.named_parameters, self.optimizer, parts)
+    def parts(self) -> Sequence[Part]:
+        return (HookState(self.hooks, self.train_hooks),)
 
     def named_parameters(self) -> dict[str, nn.Parameter]:
         """All that is trained."""
@@ -357,23 +279,14 @@ class SplatTrainer:
         method: str = METHOD,
     ) -> "SplatTrainer":
         """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
-        tensors, metadata = read_checkpoint_file(path, method, device)
+        saved = checkpoint_of(path, method, config, scene, device)
         with restoring(path):
-            state = json.loads(metadata["state"])
-            saved = config_from_dict(json.loads(metadata["config"]), str(path), type(config))
-            check_same_run(saved, config, state["views"], scene)
-            check_step(state, config.training.steps)
-            parts = tensors_by_kind(tensors)
-            x, y, z = finite(state.get("world_offset", [0.0] * 3), 3, "world_offset")  # older ones have none
-            start = SplatModel(checked_splats(parts["model"]).arrays((x, y, z)), scene.background)
+            x, y, z = finite(
+                saved.state.get("world_offset", [0.0] * 3), 3, "world_offset"
+            )  # older ones have none
+            start = SplatModel(checked_splats(saved.model).arrays((x, y, z)), scene.background)
         trainer = cls(scene, config, device, start, hooks, phase=phase, method=method)
-        with restoring(path):
-            extra = parts["extra"]
-            own = {name.removeprefix(HOOKS): v for name, v in extra.items() if name.startswith(HOOKS)}
-            restore_hooks(trainer.hooks, own)
-            trainer.train_hooks()
-            trainer.memory.restore(parts["optimizer"], extra, state)
-            trainer.step = state["step"]
+        trainer.go_on(path, saved)
         return trainer
 
 
@@ -386,24 +299,3 @@ def checked_splats(tensors: dict[str, Tensor]) -> Splats:
     if harmonics + 1 not in (1, 4, 9, 16):
         raise ValueError(f"{harmonics} harmonics are those of no degree")
     return Splats(**tensors)
-
-
-# What a profile calls the parts of a step.
-PARTS = {
-    "inside": "culling",
-    "activate": "activation and harmonics",
-    "rasterize": "projection and rasterization",
-    "compare": "loss",
-    "backward": "activation and harmonics, backward",
-    "update": "optimizer",
-    "control_density": "density control",
-}
-
-
-def stations(
-    loss: Tensor, rendered: RasterResult, gaussians: Gaussians
-) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
-    """Where the gradients of a step arrive. Autograd goes back through the projection, then through the harmonics."""
-    yield "loss, backward", (rendered.image,)
-    yield "rasterization, backward", (rendered.means2d,)
-    yield "projection, backward", (gaussians.colors,)

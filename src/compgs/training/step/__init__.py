@@ -2,8 +2,13 @@
 
 | file | holds |
 |---|---|
+| `moment` | what the phases of the run ask of the step |
 | `views_in_turn` | which views come next, and their photographs |
 | `step_views` | the anchors that a step's views may show, and its noise |
+| `latents` | quantized anchors, their rate, and the gradients that go through both |
+| `view_gradients` | what the step learns from its views |
+| `pictures` | a view drawn, compared with its photograph, and led back; the same for all trainers |
 | `dropout` | primitives that a step does without |
 | `exposures` | affine changes of color, one for each photograph |
+| `profiled` | what a profile calls the parts of the step |
 """

@@ -2,7 +2,7 @@
 
 | file | does |
 |---|---|
-| `events` | says after which steps something is due |
+| `events` | says after which steps something is due, and does it |
 | `control` | grows anchors where the image's gradient is large, and removes transparent ones |
 | `pruning` | removes anchors that are not worth their bits |
 | `importance` | measures what primitives add to the training views |
