@@ -140,7 +140,7 @@ def decode(run: Run) -> dict[str, Any]:
 
 def opened(run: Run) -> Any:
     """A .ply does not know its background, which costs the same in every color."""
-    from compgs.formats import open_scene
+    from compgs.opening import open_scene
     from compgs.training.run.run import chosen_device
 
     return open_scene(run.file, chosen_device(run.device), BLACK)

@@ -36,9 +36,10 @@ from compgs.codec.reader import read_content
 from compgs.codec.reduce import without_coupled
 from compgs.codec.writer import write_content
 from compgs.evaluation.camera_path import look_at
-from compgs.formats import open_scene, open_tiles
 from compgs.formats.tiled import read_manifest
+from compgs.formats.tiled_scene import open_tiles
 from compgs.formats.tiled_writer import NewTile, write_tiles
+from compgs.opening import open_scene
 from compgs.render import RasterSettings, local_camera, rasterize, render, visible_mask
 from compgs.scene import load_scene
 from compgs.tiles import Plan, read_plan

@@ -30,6 +30,7 @@ ALLOWED = {
         "render",
         "evaluation",
         "formats",
+        "opening",
         "exporting",
         "compressing",
         "methods",
@@ -63,8 +64,9 @@ ALLOWED = {
     "stored_weights": BASE | {"model", "entropy"},
     "trained_model": BASE | {"model", "entropy", "tensors", "devices", "stored_weights"},
     "codec": BASE | {"model", "devices", "entropy", "trained_model", "ordering"},
-    "formats": BASE
-    | {"model", "render", "devices", "codec", "methods"},  # up for a method's own files, which name it
+    "formats": BASE | {"model", "render", "devices", "codec"},
+    "published": BASE | {"model", "render", "devices", "codec", "formats"},
+    "opening": BASE | {"model", "render", "devices", "formats", "published"},
     "training": BASE
     | {"scene", "render", "model", "tensors", "devices", "entropy", "losses", "metrics", "trained_model"}
     | {
@@ -75,11 +77,11 @@ ALLOWED = {
     },  # what positions and masks take, for a size that is asked for
     "methods": BASE
     | {"scene", "model", "entropy", "render", "tensors", "devices", "losses", "metrics", "codec", "formats"}
-    | {"training", "trained_model", "stored_weights", "ordering"},
+    | {"published", "opening", "training", "trained_model", "stored_weights", "ordering"},
     "reconstruct": BASE | {"scene"},
-    "evaluation": BASE | {"scene", "render", "model", "devices", "metrics", "codec", "formats"},
-    "viewer": BASE | {"render", "model", "devices", "metrics", "codec", "formats", "evaluation"},
-    "exporting": BASE | {"render", "model", "devices", "metrics", "formats", "evaluation", "viewer"},
+    "evaluation": BASE | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "opening"},
+    "viewer": BASE | {"render", "model", "devices", "metrics", "codec", "formats", "opening", "evaluation"},
+    "exporting": BASE | {"render", "model", "devices", "metrics", "formats", "opening", "evaluation", "viewer"},
     "compressing": BASE
     | {
         "scene",
@@ -88,6 +90,7 @@ ALLOWED = {
         "devices",
         "metrics",
         "formats",
+        "opening",
         "codec",
         "evaluation",
         "training",
@@ -96,8 +99,8 @@ ALLOWED = {
     "suites": BASE | {"evaluation", "methods", "metrics"},
     "tiles": BASE | {"scene", "formats", "suites"},
     "cli": BASE
-    | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "training", "evaluation"}
-    | {"trained_model", "exporting", "compressing", "viewer", "methods", "reconstruct", "suites", "tiles"},
+    | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "opening"}
+    | {"training", "evaluation", "trained_model", "exporting", "compressing", "viewer", "methods", "reconstruct", "suites", "tiles"},
     "__main__": BASE | {"cli"},
 }
 
@@ -131,6 +134,49 @@ def test_imports_point_one_way(file: Path) -> None:
     assert imported_parts(file) <= ALLOWED[part] | {part}
 
 
+def module_imports() -> dict[str, set[str]]:
+    """The modules of the package, and which others each of them imports: anywhere in it, also for types alone. The
+    package's own face is left out, which finds its names when they are asked for.
+    """
+    files = {}
+    for file in SOURCE.rglob("*.py"):
+        names = file.relative_to(SOURCE.parent).with_suffix("").parts
+        files[".".join(names[:-1] if names[-1] == "__init__" else names)] = file
+    found: dict[str, set[str]] = {}
+    for module, file in files.items():
+        found[module] = set()
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            named = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                inner = [f"{node.module}.{alias.name}" for alias in node.names]
+                named = [name if name in files else node.module for name in inner]
+            found[module] |= {name for name in named if name in files} - {module, "compgs"}
+    return found
+
+
+def in_circles(imports: dict[str, set[str]]) -> set[str]:
+    """The modules that come back to themselves, found by taking away all those that need nobody, or that nobody needs,
+    until none is left to take.
+    """
+    left = {module: set(others) for module, others in imports.items()}
+    while True:
+        needed = set().union(*left.values()) if left else set()
+        ends = {module for module, others in left.items() if not others or module not in needed}
+        if not ends:
+            return set(left)
+        left = {module: others - ends for module, others in left.items() if module not in ends}
+
+
+def test_a_circle_of_imports_would_be_found() -> None:
+    chain = {"a": {"b"}, "b": {"c"}, "c": set(), "d": {"b"}}
+    assert in_circles(chain) == set()
+    assert in_circles({**chain, "c": {"a"}}) == {"a", "b", "c"}
+
+
+def test_no_module_needs_itself_by_way_of_others() -> None:
+    assert in_circles(module_imports()) == set()
+
+
 # What trains, and what it alone needs. Everything else computes with numpy and numba.
 HEAVY = {"torch", "scipy", "safetensors"}
 TRAINS = {
@@ -138,7 +184,7 @@ TRAINS = {
     *(f"methods.parts.{name}" for name in ("vector_quantization", "fake_quantization", "significance")),
     "methods.compact_3dgs.tensors", "methods.c3dgs.sensitivity", "methods.c3dgs.shapes",
     *(f"methods.anchors.{part}" for part in ("networks", "prediction", "model", "trainer")),
-    *(f"methods.cosa.{part}" for part in ("entropy", "model", "trainer", "writer")),
+    *(f"methods.cosa.{part}" for part in ("entropy", "model", "trainer", "writer", "rounding")),
 }  # fmt: skip
 HOOKS = "hooks"  # what a method's hooks are called, in `methods`: they train, too
 # Where one of HEAVY is loaded beside that, inside a function, for what cannot be done without it.
@@ -226,11 +272,13 @@ def test_methods_are_named_without_what_trains_them() -> None:
     assert not loaded & {"torch", "numba", "scipy", "compgs.training"}
 
 
-def test_parts_of_methods_that_open_files_load_no_torch() -> None:
-    loaded = modules_after(
-        "; ".join(f"import compgs.methods.parts.{name}" for name in ("levels", "indices", "content"))
-    )
-    assert not loaded & {"torch", "numba", "scipy", "compgs.training"}
+def test_what_opens_files_of_other_methods_loads_no_torch() -> None:
+    folder = SOURCE / "published"
+    files = [file for file in folder.rglob("*.py") if file.name != "__init__.py"]
+    names = [".".join(file.relative_to(folder).with_suffix("").parts) for file in files]
+    loaded = modules_after("; ".join(f"import compgs.published.{name}" for name in names))
+    assert {"compgs.published.c3dgs", "compgs.published.cosa.reader"} <= loaded
+    assert not loaded & {"torch", "compgs.training", "compgs.methods"}
 
 
 def test_the_command_line_starts_without_torch() -> None:

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from compgs.formats import open_scene, write_ply
+from compgs.formats import write_ply
 from compgs.model.splats import SplatArrays
+from compgs.opening import open_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 TOOL = ROOT / "tools" / "convert_folder.py"

@@ -16,13 +16,14 @@ from compgs.codec.writer import write_content
 from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import surround
 from compgs.exporting import Exported, export, own_cameras, smaller
-from compgs.formats import encoded, open_scene, read_ply, sog_streamed
+from compgs.formats import encoded, read_ply, sog_streamed
 from compgs.formats.arrays import normalized
 from compgs.formats.ply import ply_size
 from compgs.formats.tiled import read_manifest
 from compgs.formats.tiled_writer import NewTile, write_tiles
 from compgs.metrics import psnr, to_8bit
 from compgs.model.splats import SplatArrays, SplatModel
+from compgs.opening import open_scene
 from compgs.ordering.order import canonical_order, level_counts
 from compgs.render import RasterSettings, render
 

@@ -73,9 +73,9 @@ if TYPE_CHECKING:
     from compgs.evaluation import evaluate as evaluate
     from compgs.evaluation.reports import report as report
     from compgs.exporting import export
-    from compgs.formats import open_scene
     from compgs.gaussians import Gaussians
     from compgs.methods import train
+    from compgs.opening import open_scene
     from compgs.render import render
     from compgs.scene import load_scene
 

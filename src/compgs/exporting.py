@@ -21,26 +21,16 @@ from compgs.devices import chosen_device
 from compgs.errors import ConfigError, MissingDependency, NotACompGSFile, OutputError, SplatFileError
 from compgs.evaluation.camera_path import between, surround
 from compgs.evaluation.importance import splat_importance
-from compgs.formats import (
-    WRITERS,
-    SplatArrays,
-    format_of,
-    levels,
-    open_scene,
-    scene_file,
-    sog_streamed,
-    sog_streamed_writer,
-    spz,
-    told,
-)
+from compgs.formats import WRITERS, SplatArrays, levels, sog_streamed, sog_streamed_writer, spz, told
 from compgs.formats.baking import Baked, bake
 from compgs.formats.refining import refine as refine_splats
-from compgs.formats.registry import KEEP_WORLD_OFFSET
 from compgs.formats.tiled_scene import TiledScene
+from compgs.formats.writing import KEEP_WORLD_OFFSET
 from compgs.model.degrees import MAX_DEGREE
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
 from compgs.notes import note
+from compgs.opening import format_of, open_scene, scene_file
 from compgs.outputs import check_output_file, write_bytes
 from compgs.paths import as_path
 from compgs.progress import counted

@@ -9,8 +9,9 @@ import pytest
 from compgs.cli.export import report
 from compgs.cli.main import main
 from compgs.exporting import Exported
-from compgs.formats import encoded, open_scene
+from compgs.formats import encoded
 from compgs.model.splats import SplatArrays
+from compgs.opening import open_scene
 
 ORIGIN = (0.0, 0.0, 0.0)
 

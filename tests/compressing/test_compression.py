@@ -16,8 +16,9 @@ from compgs.compressing.compression import placed_cameras
 from compgs.config import Config, ModelConfig, TrainingConfig
 from compgs.errors import CheckpointError, ConfigError, NotACompGSFile, OutputError
 from compgs.evaluation.camera_path import camera_entry, read_cameras
-from compgs.formats import open_scene, write_ply
+from compgs.formats import write_ply
 from compgs.gaussians import Gaussians
+from compgs.opening import open_scene
 from compgs.render import render
 from compgs.render.settings import RasterSettings
 from compgs.tensors.reference import rasterize_reference

@@ -11,9 +11,10 @@ import pytest
 
 from compgs.errors import SplatFileError
 from compgs.exporting import export
-from compgs.formats import open_scene, read_ply
+from compgs.formats import read_ply
 from compgs.formats.arrays import Y0, SplatArrays
 from compgs.model.splats import SplatModel
+from compgs.opening import open_scene
 
 CASES = Path(__file__).parents[3] / "shared" / "cases"
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from compgs.errors import CompGSError
-from compgs.formats import FORMATS, SplatArrays, encoded, ply_compressed, ply_text
+from compgs.formats import SplatArrays, encoded, ply_compressed, ply_text
 from compgs.formats import glb as glb_format
 from compgs.formats import gltf as gltf_format
 from compgs.formats import ksplat as ksplat_format
@@ -15,6 +15,7 @@ from compgs.formats import sog as sog_format
 from compgs.formats import splat as splat_format
 from compgs.formats import spz as spz_format
 from compgs.formats.arrays import drawable
+from compgs.opening import FORMATS
 
 from .foreign import CompressedPly, gltf_file, ksplat_file, sog_first_files, text_ply, zipped
 

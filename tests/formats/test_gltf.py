@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from compgs.errors import SplatFileError
-from compgs.formats import SplatArrays, component_bytes, encoded, format_of, glb, gltf, open_scene
+from compgs.formats import SplatArrays, encoded, glb, gltf
+from compgs.opening import component_bytes, format_of, open_scene
 
 from .foreign import glb_parts, gltf_file
 

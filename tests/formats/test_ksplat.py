@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from compgs.errors import SplatFileError
-from compgs.formats import component_bytes, format_of, ksplat, open_scene
+from compgs.formats import ksplat
+from compgs.opening import component_bytes, format_of, open_scene
 
 from .foreign import BUCKET_SIDE, KSPLAT_SECTIONS, STEPS, ksplat_file, ksplat_numbers
 

@@ -14,9 +14,10 @@ import pytest
 
 from compgs import metrics
 from compgs.evaluation.camera_path import surround
-from compgs.formats import SplatArrays, encoded, open_scene
+from compgs.formats import SplatArrays, encoded
 from compgs.formats import spz as spz_format
 from compgs.formats.frames import RIGHT_UP_BACK, turned
+from compgs.opening import open_scene
 from compgs.render import render
 
 PROGRAM = os.environ.get("SPLAT_TRANSFORM") or shutil.which("splat-transform")

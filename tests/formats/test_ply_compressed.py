@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from compgs.errors import SplatFileError
-from compgs.formats import component_bytes, format_of, open_scene, ply_compressed
+from compgs.formats import ply_compressed
+from compgs.opening import component_bytes, format_of, open_scene
 
 from .foreign import CompressedPly
 

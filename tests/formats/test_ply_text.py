@@ -6,17 +6,9 @@ import numpy as np
 import pytest
 
 from compgs.errors import SplatFileError
-from compgs.formats import (
-    SplatArrays,
-    check_scene,
-    component_bytes,
-    encoded,
-    format_of,
-    open_scene,
-    ply_text,
-    read_ply,
-)
+from compgs.formats import SplatArrays, encoded, ply_text, read_ply
 from compgs.formats.ply import property_groups
+from compgs.opening import check_scene, component_bytes, format_of, open_scene
 
 from .foreign import text_ply
 

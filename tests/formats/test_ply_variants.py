@@ -7,7 +7,8 @@ import pytest
 
 from compgs.errors import SplatFileError
 from compgs.evaluation.camera_path import surround
-from compgs.formats import SplatArrays, component_bytes, encoded, open_scene, read_ply
+from compgs.formats import SplatArrays, encoded, read_ply
+from compgs.opening import component_bytes, open_scene
 from compgs.render import render
 
 

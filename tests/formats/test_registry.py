@@ -7,18 +7,10 @@ import numpy as np
 import pytest
 
 from compgs.errors import NotACompGSFile, OutputError, SplatFileError
-from compgs.formats import (
-    FORMATS,
-    WRITERS,
-    check_scene,
-    component_bytes,
-    encoded,
-    format_of,
-    open_scene,
-    writer_of,
-)
+from compgs.formats import WRITERS, encoded, writer_of
 from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
+from compgs.opening import FORMATS, check_scene, component_bytes, format_of, open_scene
 from compgs.render import Renderable
 
 from .foreign import gltf_file, ksplat_file

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from compgs.errors import SplatFileError
-from compgs.formats import format_of, sog
+from compgs.formats import sog
 from compgs.formats.arrays import harmonics_above_dc
+from compgs.opening import format_of
 
 from .foreign import SOG_COUNT, sog_first_bytes, sog_first_files, webp
 

@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 
 from compgs.errors import ConfigError, NotACompGSFile, SplatFileError
-from compgs.formats import SplatArrays, check_scene, component_bytes, format_of, open_scene, sog, sog_streamed
+from compgs.formats import SplatArrays, sog, sog_streamed
+from compgs.opening import check_scene, component_bytes, format_of, open_scene
 
 Meta = dict[str, Any]
 # A part each of 8, 4 and 3 splats, and one of the environment.

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from compgs.errors import NotACompGSFile, SplatFileError
-from compgs.formats import format_of, splat
+from compgs.formats import splat
 from compgs.formats.arrays import Y0, normalized
+from compgs.opening import format_of
 
 ROW = struct.pack("<3f3f", 1.5, -2.0, 3.25, 0.5, 0.25, 1.0) + bytes([255, 0, 51, 102, 192, 128, 128, 239])
 

@@ -18,12 +18,19 @@ from compgs.codec.writer import write_content
 from compgs.devices import drawn
 from compgs.errors import BitstreamError, ConfigError, CorruptSection, NotACompGSFile, UnsupportedVersion
 from compgs.evaluation.camera_path import look_at, orbit
-from compgs.formats import check_scene, component_bytes, format_of, open_scene, open_tiles
 from compgs.formats.tile_detail import levels_with_whole, wanted_levels
 from compgs.formats.tiled import Core, GroundAxes, read_manifest
-from compgs.formats.tiled_scene import ASKED_BY, TileCache, TiledScene, resident_bytes, tile_memory
+from compgs.formats.tiled_scene import (
+    ASKED_BY,
+    TileCache,
+    TiledScene,
+    open_tiles,
+    resident_bytes,
+    tile_memory,
+)
 from compgs.formats.tiled_writer import NewTile, _counted_from, common_offset, spheres, write_tiles
 from compgs.gaussians import Gaussians
+from compgs.opening import check_scene, component_bytes, format_of, open_scene
 from compgs.ordering.order import canonical_order, level_counts
 from compgs.render import RasterSettings, Renderable, local_camera, rasterize, render, settings_of
 

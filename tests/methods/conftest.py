@@ -18,10 +18,12 @@ import compgs
 from compgs import methods, metrics, render
 from compgs.config import Config, Range
 from compgs.errors import SplatFileError
-from compgs.formats import SplatArrays, open_scene
+from compgs.formats import SplatArrays
 from compgs.formats.packed import SUFFIX, Packed, packed_bits, read, splat_model, unpacked_bits, write_packed
 from compgs.methods import METHODS, SPLAT_SETTINGS, Method
 from compgs.model.splats import SplatModel
+from compgs.opening import open_scene
+from compgs.published import READERS
 from compgs.render.render_model import Renderable
 from compgs.scene.views import Scene
 from compgs.tensors.splats import Splats
@@ -130,7 +132,6 @@ TOY = Method(
     uses=(*SPLAT_SETTINGS, "toy"),
     train=train,
     write=write,
-    open=open_file,
     settings=ToyConfig,
     presets={"heavy": {"toy": {"weight": 1.0}}},
     from_splats=True,
@@ -141,6 +142,7 @@ TOY = Method(
 def toy(monkeypatch: pytest.MonkeyPatch) -> Method:
     """That method, registered."""
     monkeypatch.setitem(METHODS, "toy", TOY)
+    monkeypatch.setitem(READERS, "toy", open_file)
     return TOY
 
 

@@ -10,10 +10,10 @@ from compgs.config import Config, ModelConfig, TrainingConfig
 from compgs.errors import ConfigError
 from compgs.methods.anchors.model import AnchorModel, initial_anchors
 from compgs.methods.anchors.prediction import predict_anchors
-from compgs.methods.anchors.scene import network_shapes
 from compgs.methods.anchors.settings import AnchorSection
 from compgs.methods.anchors.trainer import PARTS, AnchorTrainer, train_anchors
 from compgs.model.constants import CUTOFF_SIGMAS
+from compgs.published.anchors import network_shapes
 from compgs.render import Renderable
 from compgs.scene.views import Scene
 from compgs.training.run.profile import StepProfile
@@ -98,7 +98,7 @@ def test_parts_together_are_the_whole(
 ) -> None:
     scene, camera = model.as_hybrid_model(), blob_scene.test_views[0].camera
     whole = scene.gaussians(camera)
-    monkeypatch.setattr("compgs.methods.anchors.scene.BLOCK", 50)
+    monkeypatch.setattr("compgs.published.anchors.BLOCK", 50)
     assert len(list(scene.parts(camera))) == -(-model.anchors // 50)
     again = scene.gaussians(camera)
     for name, value in vars(whole).items():

@@ -11,14 +11,12 @@ import torch
 
 from compgs.config import SplatConfig, TrainingConfig
 from compgs.errors import SplatFileError
-from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import Packed, read, write_packed
 from compgs.formats.sog import morton_order
 from compgs.methods import METHODS, settings_of
-from compgs.methods.c3dgs import C3DGSConfig, C3DGSSection
-from compgs.methods.c3dgs.files import splats_of
 from compgs.methods.c3dgs.hooks import SharedEntries, shared
 from compgs.methods.c3dgs.sensitivity import sensitivities
+from compgs.methods.c3dgs.settings import C3DGSConfig, C3DGSSection
 from compgs.methods.c3dgs.shapes import (
     covariances,
     quaternions_of,
@@ -26,6 +24,8 @@ from compgs.methods.c3dgs.shapes import (
     scales_and_rotations,
 )
 from compgs.model.splats import SplatModel
+from compgs.opening import component_bytes, open_scene
+from compgs.published.c3dgs import splats_of
 from compgs.render import RasterSettings, Renderable, render
 from compgs.scene.views import Scene
 from compgs.tensors.rasterize import rasterize

@@ -12,14 +12,14 @@ import torch
 
 from compgs.config import SplatConfig, TrainingConfig
 from compgs.errors import SplatFileError
-from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import Packed, read, write_packed
 from compgs.methods import settings_of
-from compgs.methods.compact3d import Compact3DConfig, Compact3DSection
-from compgs.methods.compact3d.files import splats_of
 from compgs.methods.compact3d.hooks import CODED, LearnedCodebooks
+from compgs.methods.compact3d.settings import Compact3DConfig, Compact3DSection
 from compgs.methods.parts.vector_quantization import first_codes, k_means
 from compgs.model.splats import SplatModel
+from compgs.opening import component_bytes, open_scene
+from compgs.published.compact3d import splats_of
 from compgs.render import Renderable, render
 from compgs.scene.views import Scene
 from compgs.training import Hooks, Phase, Run, SplatTrainer, train_phases

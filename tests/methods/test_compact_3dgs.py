@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from compgs.formats import component_bytes, open_scene
 from compgs.methods import settings_of, train, write
-from compgs.methods.compact_3dgs.color_network import ColorNetwork, contracted, network_shapes
-from compgs.methods.compact_3dgs.hash_grid import GridLayout, grid_features
 from compgs.methods.compact_3dgs.hooks import Compact
 from compgs.methods.compact_3dgs.tensors import color_coefficients, features, features_reference
 from compgs.methods.compact_3dgs.tensors import contracted as contracted_tensors
 from compgs.methods.parts.vector_quantization import residual_labels
 from compgs.model.spherical_harmonics import COLOR_OFFSET
 from compgs.model.spherical_harmonics_kernels import Y0
+from compgs.opening import component_bytes, open_scene
+from compgs.published.compact_3dgs.color_network import ColorNetwork, contracted, network_shapes
+from compgs.published.compact_3dgs.hash_grid import GridLayout, grid_features
 from compgs.render import Renderable, render
 from compgs.scene.views import Scene
 from compgs.training import SplatTrainer

@@ -12,15 +12,16 @@ from compgs.codec.integer_network import FRACTION_BITS
 from compgs.config import Config
 from compgs.errors import CompGSError, NotEncodable, SplatFileError
 from compgs.exporting import export
-from compgs.formats import component_bytes, open_scene, packed
+from compgs.formats import packed
 from compgs.methods import METHODS, settings_of, train, write
 from compgs.methods.cosa import reader
-from compgs.methods.cosa.chain import coordinate_inputs
 from compgs.methods.cosa.model import CosaModel
 from compgs.methods.cosa.settings import CosaConfig
-from compgs.methods.cosa.shape import GROUPS
 from compgs.methods.cosa.trainer import BITS_PER_MEGABYTE, CosaTrainer
-from compgs.methods.cosa.writer import content_of, packed_content
+from compgs.methods.cosa.writer import packed_content
+from compgs.opening import component_bytes, open_scene
+from compgs.published.cosa.chain import coordinate_inputs
+from compgs.published.cosa.shape import GROUPS
 from compgs.render import render
 from compgs.scene.views import Scene
 
@@ -71,7 +72,7 @@ def test_the_suffix_is_the_containers() -> None:
 def test_a_file_holds_the_symbols_that_were_written_and_shows_what_was_trained(
     trained: CosaModel, file: Path, blob_scene: Scene
 ) -> None:
-    written, read = content_of(trained), reader.content_of(packed.read(file))
+    written, read = trained.content(), reader.content_of(packed.read(file))
     assert 0 < read.mask.sum() < read.mask.size, "no mask fell: the test is too weak"
     assert len(written.symbols) == 4 + 4
     for name in ("symbols", "tables"):
@@ -91,7 +92,7 @@ def test_a_file_holds_the_symbols_that_were_written_and_shows_what_was_trained(
 
 def test_what_the_file_has_is_what_training_saw_but_for_the_rounding(trained: CosaModel) -> None:
     """Half a step at most, and a little where the integer networks round a mean to the other side."""
-    content = content_of(trained)
+    content = trained.content()
     place = {tuple(c): i for i, c in enumerate(trained.coordinates.tolist())}
     rows = [place[tuple(c)] for c in content.coordinates.tolist()]
     for group in ("latent", "feature", "position_scale", "size"):
@@ -103,7 +104,7 @@ def test_what_the_file_has_is_what_training_saw_but_for_the_rounding(trained: Co
 
 def test_the_integer_chain_is_the_float_chain(trained: CosaModel) -> None:
     """Values of one are those of the other, but for what falls to the other side of a rounding."""
-    content = content_of(trained)
+    content = trained.content()
     place = {tuple(c): i for i, c in enumerate(trained.coordinates.tolist())}
     rows = [place[tuple(c)] for c in content.coordinates.tolist()]
     with torch.no_grad():
@@ -312,7 +313,7 @@ def with_array(content: packed.Packed, name: str, data: bytes) -> packed.Packed:
 
 @pytest.fixture(scope="module")
 def content(trained: CosaModel) -> packed.Packed:
-    return packed_content(content_of(trained))
+    return packed_content(trained.content())
 
 
 @pytest.mark.parametrize("name", ["positions", "context", "networks", "latents"])

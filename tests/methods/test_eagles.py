@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import Packed
 from compgs.methods import settings_of, train, write
-from compgs.methods.eagles.file import cosines, decoded
 from compgs.methods.eagles.hooks import Latents, image_scale
-from compgs.methods.parts.histogram import packed_symbols, unpacked_symbols
 from compgs.methods.parts.significance import view_significance
+from compgs.opening import component_bytes, open_scene
+from compgs.published.eagles import cosines, decoded
+from compgs.published.parts.histogram import packed_symbols, unpacked_symbols
 from compgs.render import render
 from compgs.scene.views import Scene
 from compgs.training import SplatTrainer

@@ -12,15 +12,15 @@ import torch
 from compgs import metrics
 from compgs.config import SplatConfig, TrainingConfig
 from compgs.errors import SplatFileError
-from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import Packed, read, write_packed
 from compgs.losses import Target
 from compgs.methods import METHODS, settings_of, train
-from compgs.methods.lightgaussian import LightGaussianConfig, LightGaussianSection
-from compgs.methods.lightgaussian.files import splat_bytes, splats_of
 from compgs.methods.lightgaussian.hooks import Distilled, Pruned, content, entries, significance
+from compgs.methods.lightgaussian.settings import LightGaussianConfig, LightGaussianSection
 from compgs.methods.parts.significance import view_significance
 from compgs.model.splats import SplatModel
+from compgs.opening import component_bytes, open_scene
+from compgs.published.lightgaussian import splat_bytes, splats_of
 from compgs.render import Renderable, render
 from compgs.scene.views import Scene
 from compgs.training import Phase, Run, SplatTrainer, fine_tuning, train_phases

@@ -15,10 +15,12 @@ from compgs.cli import train as train_command
 from compgs.cli.main import main
 from compgs.config import Config, SplatConfig, TrainingConfig
 from compgs.errors import CheckpointError, ConfigError, SplatFileError
-from compgs.formats import component_bytes, open_scene, write_ply
+from compgs.formats import write_ply
 from compgs.formats.packed import SUFFIX
 from compgs.methods import METHODS, settings_of, train, write
 from compgs.model.splats import SplatModel
+from compgs.opening import component_bytes, open_scene
+from compgs.published import READERS
 from compgs.render import render
 from compgs.scene.generated import generate_scene
 from compgs.scene.views import Points, Scene
@@ -47,7 +49,7 @@ def test_the_registry_says_what_a_reader_needs_to_know() -> None:
     assert list(METHODS)[:4] == ["compgs", "3dgs", "spz", "sog"]
     for name, method in METHODS.items():
         assert name == method.name and method.suffix.startswith(".")
-        assert method.open is None or method.suffix == SUFFIX
+        assert (name in READERS) == (method.suffix == SUFFIX)
         assert method.description and method.reference
         assert isinstance(settings_of(name), method.settings)
 

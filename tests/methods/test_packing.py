@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from compgs.errors import SplatFileError
-from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import (
     MAGIC,
     Packed,
@@ -20,6 +19,7 @@ from compgs.formats.packed import (
     unpacked_bits,
     write_packed,
 )
+from compgs.opening import component_bytes, open_scene
 
 RNG = np.random.default_rng(0)
 ARRAYS = {

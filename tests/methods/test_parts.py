@@ -10,16 +10,7 @@ import torch
 from compgs.errors import SplatFileError
 from compgs.formats.packed import Packed
 from compgs.methods.parts.books import entries_within
-from compgs.methods.parts.content import stored_place
 from compgs.methods.parts.fake_quantization import fake_half, fake_levels, straight_through
-from compgs.methods.parts.indices import (
-    index_bits,
-    label_counts,
-    packed_indices,
-    stored_counts,
-    stored_indices,
-)
-from compgs.methods.parts.levels import Levels, stored_levels
 from compgs.methods.parts.significance import all_but_lowest, view_significance
 from compgs.methods.parts.vector_quantization import (
     averaged_codes,
@@ -31,6 +22,15 @@ from compgs.methods.parts.vector_quantization import (
     residual_labels,
     residual_sums,
 )
+from compgs.published.parts.content import stored_place
+from compgs.published.parts.indices import (
+    index_bits,
+    label_counts,
+    packed_indices,
+    stored_counts,
+    stored_indices,
+)
+from compgs.published.parts.levels import Levels, stored_levels
 from compgs.render import RasterSettings
 from compgs.scene.views import Scene
 from compgs.tensors.rasterize import rasterize

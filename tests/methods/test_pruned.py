@@ -11,12 +11,12 @@ import torch
 
 from compgs.config import SplatConfig, TrainingConfig
 from compgs.errors import ConfigError
-from compgs.formats import open_scene
 from compgs.methods import METHODS, settings_of, train, write
 from compgs.methods.parts.significance import view_significance
 from compgs.methods.pruned import PrunedConfig, PrunedSection
 from compgs.methods.pruned.hooks import Pruned
 from compgs.model.splats import SplatModel
+from compgs.opening import open_scene
 from compgs.render import Renderable, render
 from compgs.scene.views import Scene
 from compgs.training import SplatTrainer

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from compgs.formats import component_bytes, open_scene
 from compgs.formats.packed import read
 from compgs.methods import settings_of, train, write
+from compgs.opening import component_bytes, open_scene
 from compgs.render import Renderable, render
 from compgs.scene.views import Scene
 

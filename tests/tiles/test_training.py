@@ -16,9 +16,9 @@ from compgs.cli import train as train_command
 from compgs.cli.main import main
 from compgs.cli.tiles import _compute as options_of_tiles
 from compgs.cli.train import Train
-from compgs.formats import component_bytes, open_scene
 from compgs.formats.tiled import read_manifest
 from compgs.formats.tiled_scene import ASKED_BY, TiledScene
+from compgs.opening import component_bytes, open_scene
 from compgs.scene.generated import generate_scene
 from compgs.suites import jobs as jobs_module
 from compgs.tiles import read_plan

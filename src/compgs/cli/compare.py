@@ -76,7 +76,7 @@ class Compare(JsonOption, ComputingCommand, ReadingOptions, MemoryOption):
         if self.scene is not None and self.cameras is not None:
             raise UsageError("--scene and --cameras were both given; give one")
         self.allow_memory()
-        from compgs.formats import check_scene
+        from compgs.opening import check_scene
 
         for file in (self.a, self.b):
             check_scene(file)

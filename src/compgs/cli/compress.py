@@ -166,7 +166,7 @@ class Compress(ComputingCommand, LevelOption):
         seconds = None if self.time is None else parse_time(self.time, "--time")
         assignments = self.assignments()
         from compgs.compressing import begin, default_config
-        from compgs.formats import check_scene
+        from compgs.opening import check_scene
 
         assert self.file is not None
         check_scene(self.file)

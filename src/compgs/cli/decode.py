@@ -66,8 +66,8 @@ class Decode(DecodingCommand, FileArgument):
             raise UsageError(
                 f"--prefix {self.prefix}: {manifest} is of a scene in tiles; give the file of one"
             )
-        from compgs.formats import check_scene
         from compgs.formats.tiled import read_manifest, tile_bytes
+        from compgs.opening import check_scene
 
         check_scene(manifest)
         if self.output is not None:

@@ -69,7 +69,7 @@ class Evaluate(JsonOption, DecodingCommand, SceneOptions, SceneFileOrRunArgument
     runs that were trained with --set training.exposure=true."""
 
     def run(self) -> None:
-        from compgs.formats import check_scene
+        from compgs.opening import check_scene
 
         self.allow_memory()
         file, run = file_and_run(self.file)

@@ -67,7 +67,7 @@ class Export(DecodingCommand, SceneFileArgument, LevelOption):
             check_range("--degree", self.degree, 0, 3)
         check_range("--refine", self.refine, 0, 100_000)
         most = None if self.max_bytes is None else parse_size(self.max_bytes, "--max-bytes")
-        from compgs.formats import check_scene
+        from compgs.opening import check_scene
 
         check_scene(self.file)
         self.prepare("decode", "render")

@@ -44,7 +44,7 @@ class Info(JsonOption, Command, SceneFileOrRunArgument):
     """
 
     def run(self) -> None:
-        from compgs.formats import format_of
+        from compgs.opening import format_of
 
         if manifest := tiles_manifest(self.file):
             tell_tiles(manifest, json=self.json)
@@ -72,8 +72,8 @@ class Info(JsonOption, Command, SceneFileOrRunArgument):
 
 def tell_splats(path: Path, *, json: bool) -> None:
     """Say what is in a file of another format. Raises SplatFileError, MissingDependency."""
-    from compgs.formats import check_scene, component_bytes, format_of, open_scene
     from compgs.model.splats import SplatModel
+    from compgs.opening import check_scene, component_bytes, format_of, open_scene
 
     check_scene(path)
     model = open_scene(path)
@@ -112,8 +112,8 @@ def file_facts(path: Path, info: "FileInfo") -> dict[str, Any]:
 
 def tell_tiles(path: Path, *, json: bool) -> None:
     """Raises BitstreamError."""
-    from compgs.formats import check_scene, component_bytes
     from compgs.formats.tiled import read_manifest
+    from compgs.opening import check_scene, component_bytes
 
     check_scene(path)
     manifest, components = read_manifest(path), component_bytes(path)

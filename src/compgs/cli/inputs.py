@@ -17,7 +17,7 @@ def check_bitstream(path: Path) -> None:
 def tiles_manifest(path: Path) -> Path | None:
     """The manifest, where the path is one, or a folder of tiles, or of a run in tiles. Raises NotACompGSFile."""
     from compgs.cli.run_folder import manifest_of
-    from compgs.formats import format_of, scene_file
+    from compgs.opening import format_of, scene_file
 
     of_run = manifest_of(path)
     file = of_run if path.is_dir() and of_run.is_file() else scene_file(path)
@@ -26,7 +26,7 @@ def tiles_manifest(path: Path) -> Path | None:
 
 def read_bitstream(path: Path) -> bytes:
     """The bytes of a .cgs file. Raises NotACompGSFile."""
-    from compgs.formats import format_of
+    from compgs.opening import format_of
 
     found = format_of(path).name
     if found != "cgs":

@@ -127,7 +127,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
 
     def run(self) -> None:
         self.check_values()
-        from compgs.formats import check_scene, open_scene
+        from compgs.opening import check_scene, open_scene
 
         self.allow_memory()
         file, run = file_and_run(self.file)
@@ -305,7 +305,7 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
     def labelled(self, frames: "Iterator[np.ndarray]") -> "Iterator[np.ndarray]":
         """Write --label on each frame."""
         from compgs.evaluation.animation import labelled
-        from compgs.formats import component_bytes
+        from compgs.opening import component_bytes
 
         file, _ = file_and_run(self.file)
         whole = sum(component_bytes(file).values())  # of all files, if the scene is in several

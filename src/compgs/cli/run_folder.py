@@ -204,7 +204,7 @@ def file_and_run(path: Path) -> tuple[Path, RunSettings | None]:
     """
     folder = path if path.is_dir() else path.parent
     if not (folder / SETTINGS_NAME).is_file():
-        from compgs.formats import scene_file
+        from compgs.opening import scene_file
 
         return scene_file(path), None
     if not path.is_dir():

@@ -43,7 +43,7 @@ def _with_exchanged(words: Sequence[str], one: Path, other: Path) -> str | None:
 
 def _holds_splats(path: Path) -> bool:
     from compgs.cli.run_folder import file_and_run
-    from compgs.formats import format_of
+    from compgs.opening import format_of
 
     try:
         format_of(file_and_run(path)[0])

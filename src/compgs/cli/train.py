@@ -329,7 +329,7 @@ class Train(ComputingCommand, SceneOptions):
         """Raises UsageError, SplatFileError for splats that the method has no use for, or that are none."""
         if self.from_splats is None:
             return
-        from compgs.formats import check_scene
+        from compgs.opening import check_scene
 
         if not method.from_splats:
             raise UsageError(f"--from-splats: --method {method.name} does not begin with plain 3DGS")

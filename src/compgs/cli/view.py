@@ -59,7 +59,7 @@ class View(DecodingCommand, SceneFileOrRunArgument, LevelOption, MemoryOption):
 
     def run(self) -> None:
         self.check_values()
-        from compgs.formats import check_scene
+        from compgs.opening import check_scene
 
         self.allow_memory()
         file, _ = file_and_run(self.file)

@@ -9,8 +9,9 @@ from statistics import fmean
 from compgs import metrics
 from compgs.devices import CPU
 from compgs.errors import SplatFileError
-from compgs.formats import encoded, open_scene, told
+from compgs.formats import encoded, told
 from compgs.model.splats import ORIGIN, SplatModel
+from compgs.opening import open_scene
 from compgs.render import Renderable, render
 from compgs.scene.views import View
 

@@ -29,10 +29,10 @@ from compgs.devices import chosen_device
 from compgs.errors import CheckpointError, ConfigError, NotACompGSFile, OutputError, SplatFileError
 from compgs.evaluation import evaluate
 from compgs.evaluation.results import Results
-from compgs.formats import component_bytes, format_of, open_scene
 from compgs.methods import train
 from compgs.model.splats import SplatModel
 from compgs.occupied import occupied
+from compgs.opening import component_bytes, format_of, open_scene
 from compgs.outputs import check_output_file, check_output_folder, write_json
 from compgs.paths import as_path
 from compgs.progress import shown_training

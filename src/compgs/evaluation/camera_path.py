@@ -16,6 +16,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
+from compgs.evaluation.capture_cameras import EXPECTED, cameras_of_capture, is_capture
 from compgs.numerics.rotations import quaternion_from_rotation, rigid, rotation_from_quaternion
 from compgs.scene.text_files import decoded
 
@@ -24,10 +25,6 @@ MAX_SIDE = 16_384  # pixels
 FIELDS = ("world_to_camera", "fx", "fy", "cx", "cy", "width", "height")
 # By which an entry of the cameras.json of 3DGS is known, and what it has beside that.
 OF_3DGS = ("position", "rotation", "fx", "fy", "width", "height")
-EXPECTED = (
-    "expected the folder of a COLMAP model (sparse/0), transforms.json, transforms_train.json, or a list of cameras as "
-    "3DGS (cameras.json) and compgs write them"
-)
 
 
 USUAL_DISTANCE = 2.2  # of a circle from the middle of a scene, in radii of the scene
@@ -113,7 +110,6 @@ def read_cameras(path: Path) -> list[tuple[str, Camera]]:
 
     Raises SceneError.
     """
-    from compgs.evaluation.capture_cameras import cameras_of_capture, is_capture
 
     if is_capture(path):
         return cameras_of_capture(path)

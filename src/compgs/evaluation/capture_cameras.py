@@ -7,7 +7,6 @@ from pathlib import Path
 
 from compgs.cameras import Camera
 from compgs.errors import SceneError, UnsupportedCamera
-from compgs.evaluation.camera_path import EXPECTED
 from compgs.scene.blender import read_blender
 from compgs.scene.capture import PosedImage, check_camera
 from compgs.scene.colmap import find_sparse_model
@@ -15,6 +14,10 @@ from compgs.scene.colmap_capture import read_colmap
 from compgs.scene.frames import read_frames
 from compgs.scene.nerfstudio import read_nerfstudio
 
+EXPECTED = (
+    "expected the folder of a COLMAP model (sparse/0), transforms.json, transforms_train.json, or a list of cameras as "
+    "3DGS (cameras.json) and compgs write them"
+)
 LAYOUTS = {"transforms_train.json": read_blender, "transforms.json": read_nerfstudio}
 LONGEST_LENS = 16.0  # widths of the picture: a focal length in pixels, and a size that nobody knows, are more
 

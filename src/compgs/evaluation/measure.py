@@ -22,8 +22,8 @@ from compgs.evaluation.exposure import DESCRIPTION, exposed_by_left_half, right_
 from compgs.evaluation.fit import misfits
 from compgs.evaluation.held_out import check_held_out, check_view, degrees_to_training
 from compgs.evaluation.results import Results, ViewResult
-from compgs.formats import component_bytes, open_scene, scene_file, scene_name
 from compgs.numerics.compiling import working_seconds
+from compgs.opening import component_bytes, open_scene, scene_file, scene_name
 from compgs.outputs import check_output_folder, write_bytes, write_json
 from compgs.paths import as_path
 from compgs.progress import counted

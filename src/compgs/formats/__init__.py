@@ -1,4 +1,5 @@
-"""Files of splats, opened by their first bytes: our own and those of other programs, readers and writers side by side.
+"""Files of splats: our own and those of other programs, readers and writers side by side. `compgs.opening` knows them
+by their first bytes.
 
 | format | read | written | bytes a splat (degree 3) |
 |---|---|---|---|
@@ -17,36 +18,13 @@
 
 from compgs.formats.arrays import SplatArrays
 from compgs.formats.ply import read_ply, write_ply
-from compgs.formats.registry import (
-    FORMATS,
-    WRITERS,
-    Format,
-    check_scene,
-    component_bytes,
-    encoded,
-    format_of,
-    open_scene,
-    scene_file,
-    scene_name,
-    told,
-    writer_of,
-)
-from compgs.formats.tiled import open_tiles
+from compgs.formats.writing import WRITERS, encoded, told, writer_of
 
 __all__ = [
-    "FORMATS",
     "WRITERS",
-    "Format",
     "SplatArrays",
-    "check_scene",
-    "component_bytes",
     "encoded",
-    "format_of",
-    "open_scene",
-    "open_tiles",
     "read_ply",
-    "scene_file",
-    "scene_name",
     "told",
     "write_ply",
     "writer_of",

@@ -12,17 +12,13 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from compgs.cameras import Camera
 from compgs.codec.format import LARGEST_DILATION, SMALLEST_DILATION
 from compgs.errors import CorruptSection, NotACompGSFile, TruncatedSection, UnsupportedVersion
-
-if TYPE_CHECKING:
-    from compgs.devices import Device
-    from compgs.formats.tiled_scene import TiledScene
 
 SUFFIX = ".tiles"  # of the folder's name
 MANIFEST = "manifest.json"
@@ -197,21 +193,6 @@ def component_bytes(path: Path) -> dict[str, int]:
         for section in sections:
             total[section.name] = total.get(section.name, 0) + section.bytes
     return {**total, "manifest": path.stat().st_size}
-
-
-def open_tiles(
-    path: Path,
-    device: "Device" = "cpu",
-    *,
-    memory: int | None = None,  # bytes of open tiles; None: `compgs.formats.tiled_scene.tile_memory`
-    most_splats: int
-    | None = None,  # of a picture: tiles are as fine as there is room for. None: all there are
-) -> "TiledScene":
-    """A scene of tiles that are opened when a camera sees them. Raises BitstreamError, ConfigError."""
-    from compgs.formats.tiled_scene import TiledScene
-
-    check(path)
-    return TiledScene.of(path.parent, read_manifest(path), str(device), memory, most_splats)
 
 
 # to and from JSON --------------------------------------------------------------------------------------------------

@@ -17,10 +17,10 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.codec.decoder import decode_bytes
-from compgs.devices import CPU, check_device, drawn
+from compgs.devices import CPU, Device, check_device, drawn
 from compgs.errors import ConfigError, CorruptSection
 from compgs.formats.tile_detail import levels_with_whole, wanted_levels
-from compgs.formats.tiled import COPY, Manifest, Vector, tile_bytes
+from compgs.formats.tiled import COPY, Manifest, Vector, check, read_manifest, tile_bytes
 from compgs.gaussians import Gaussians
 from compgs.model.hybrid_model import HybridModel
 from compgs.render.contributions import Blended
@@ -104,6 +104,19 @@ class TileCache:
         while self._open and self.bytes + size > self.most_bytes:
             victim = next((each for each in self._open if each not in wanted), next(reversed(self._open)))
             self.bytes -= self._open.pop(victim)[1]
+
+
+def open_tiles(
+    path: Path,
+    device: "Device" = "cpu",
+    *,
+    memory: int | None = None,  # bytes of open tiles; None: `tile_memory`
+    # of a picture: tiles are as fine as there is room for. None: all there are
+    most_splats: int | None = None,
+) -> "TiledScene":
+    """A scene of tiles that are opened when a camera sees them. Raises BitstreamError, ConfigError."""
+    check(path)
+    return TiledScene.of(path.parent, read_manifest(path), str(device), memory, most_splats)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ file on disk are the same for all methods; a run's config.json, checkpoint and r
 
 ## How to add a method
 
-A method is a file or a folder of this package, and a line in `METHODS` below. One that compresses plain 3DGS trains by
+A method is a file or a folder of this package, and a line of `registry`. One that compresses plain 3DGS trains by
 `compgs.training.train_phases` with hooks of its own (`compgs.training.Hooks`: what is drawn, what is added to the loss,
 what happens after a step), and keeps its file in the shared container (`compgs.formats.packed`), which is opened by its
 first bytes wherever a scene is. `compgs.methods.parts` has what several methods are made of. Modules here are loaded
@@ -39,47 +39,20 @@ with three bits of color and stores them so:
         ...
         return write_packed(path, Packed("coarse", {"levels": config.coarse.levels}, {"colors": indices, ...}))
 
-    def open_file(packed, device, background):
+    def opened(packed, device, background):  # in compgs/published/coarse.py, named in READERS there
         colors = packed.array("colors", np.uint8, (None, 3)) / (packed.whole_number("levels", 2, 256) - 1)
         ...
         return splat_model(packed, SplatArrays(...), device, background)
 
     METHOD = Method("coarse", "Plain 3DGS with few colors", "nobody, 2026", PACKED_SUFFIX,
-                    (*SPLAT_SETTINGS, "coarse"), train, write, open_file, CoarseConfig, from_splats=True)
+                    (*SPLAT_SETTINGS, "coarse"), train, write, CoarseConfig, from_splats=True)
 
 Its settings are then `--set coarse.levels=16`, and its tests: a file's bytes by the method's byte law, the round trip,
 a run that was stopped and continued (`tests/methods`).
 """
 
-from compgs.methods import hybrid, splats
-from compgs.methods.c3dgs import C3DGS
-from compgs.methods.compact3d import COMPACT3D
-from compgs.methods.compact_3dgs import COMPACT_3DGS
-from compgs.methods.cosa import COSA
-from compgs.methods.eagles import EAGLES
-from compgs.methods.lightgaussian import LIGHTGAUSSIAN
 from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method
-from compgs.methods.pruned import PRUNED_SOG, PRUNED_SPZ
+from compgs.methods.registry import METHODS
 from compgs.methods.running import settings_of, train, write
-from compgs.methods.scaffold_gs import SCAFFOLD_GS
-
-METHODS: dict[str, Method] = {
-    method.name: method
-    for method in (
-        hybrid.COMPGS,
-        splats.PLAIN,
-        splats.SPZ,
-        splats.SOG,
-        PRUNED_SPZ,
-        PRUNED_SOG,
-        COMPACT3D,
-        C3DGS,
-        LIGHTGAUSSIAN,
-        EAGLES,
-        COMPACT_3DGS,
-        SCAFFOLD_GS,
-        COSA,
-    )
-}
 
 __all__ = ["METHODS", "PACKED_SUFFIX", "SPLAT_SETTINGS", "Method", "settings_of", "train", "write"]

@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from compgs.config import Config
 
 if TYPE_CHECKING:
-    from compgs.devices import Device
-    from compgs.formats.packed import Packed
     from compgs.model.splats import SplatModel
-    from compgs.render.render_model import Renderable
     from compgs.scene.views import Scene
     from compgs.training.run.run import Run
 
@@ -61,8 +58,6 @@ class Method:
     train: Trains
     # Writes it whole or not at all, replacing what is there; the number of bytes. Raises OutputError.
     write: Callable[[Any, Path, Any], int]  # what was trained, path, settings
-    # Opens the method's own container, where it has one; other files are known by their format. Raises SplatFileError.
-    open: "Callable[[Packed, Device, tuple[float, float, float]], Renderable] | None" = None
     settings: type[Config] = Config  # or a dataclass derived from it, with a section of the method's own
     # Its own, beside those of `compgs.config`: what differs from the default, by section and name.
     presets: Presets = field(default_factory=dict)

@@ -9,6 +9,7 @@ from compgs.config import PRESETS, Config, check_config, config_from_dict, load_
 from compgs.errors import ConfigError
 from compgs.extras import require
 from compgs.methods.method import Method
+from compgs.methods.registry import METHODS
 from compgs.notes import note
 from compgs.occupied import occupied_if_given
 from compgs.paths import as_path
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
 
 def method_of(name: str) -> Method:
     """Raises ConfigError for a name that no method has."""
-    from compgs.methods import METHODS
-
     if name not in METHODS:
         raise ConfigError(f"method {name!r} does not exist; there are {', '.join(METHODS)}")
     return METHODS[name]
@@ -124,8 +123,8 @@ def write(model: Any, path: str | Path, *, method: str = "compgs", config: Confi
 
 def opened_splats(path: str | Path, scene: "Scene") -> "SplatModel":
     """The splats of a file, to begin with. Raises SplatFileError, BitstreamError, ConfigError for another scene."""
-    from compgs.formats import open_scene
     from compgs.model.splats import SplatModel
+    from compgs.opening import open_scene
 
     model = open_scene(path, background=scene.background)
     if not isinstance(model, SplatModel):

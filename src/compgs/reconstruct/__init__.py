@@ -9,7 +9,8 @@ worker.py        the process that runs them                         report.py   
 
 from compgs.reconstruct.mapping import Stage
 from compgs.reconstruct.photographs import find_photographs, holds_photographs
-from compgs.reconstruct.reconstruct import Reconstruction, ReconstructOptions, reconstruct
+from compgs.reconstruct.reconstruct import ReconstructOptions, reconstruct
+from compgs.reconstruct.reconstruction import Reconstruction
 
 __all__ = [
     "ReconstructOptions",

@@ -23,6 +23,7 @@ from compgs.reconstruct.photographs import (
     store_masks,
     store_upright,
 )
+from compgs.reconstruct.reconstruction import Reconstruction
 from compgs.reconstruct.report import picture, summary
 from compgs.scene.colmap import SparseModel, read_sparse_model
 from compgs.scene.masks import FOLDER as MASKS
@@ -48,25 +49,6 @@ class ReconstructOptions:
     undistort: bool = False  # write pinhole images, for programs that read no others
     threads: int | None = None
     seed: int = 0
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """What came out."""
-
-    scene: Path
-    photographs: int  # found
-    registered: int  # with a pose
-    missing: tuple[str, ...]  # names of those without
-    points: int
-    reprojection_error: float  # pixels, mean over the points
-    observations: float  # points seen by a photograph, mean
-    models: int  # that COLMAP made, from different first pairs; the largest is the scene
-    lens: str
-    matching: str
-    seconds: dict[str, float]  # by stage
-    masks: int = 0  # found, of which photographs have one
-    masks_kept: bool = True  # in the scene; undistorted photographs have other pixels than their masks
 
 
 def reconstruct(

@@ -1,16 +1,14 @@
 """What a reconstruction is, for programs (JSON) and for people (a picture from above and from the side)."""
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
 
 from compgs.numerics.rotations import rotation_from_quaternion
+from compgs.reconstruct.reconstruction import Reconstruction
 from compgs.scene.colmap import ColmapImage, SparseModel
-
-if TYPE_CHECKING:
-    from compgs.reconstruct.reconstruct import Reconstruction
 
 PANEL = 480  # pixels: width and height of each of the two views
 MARGIN = 24
@@ -19,7 +17,7 @@ CAMERA = (214, 39, 40)
 MOST_POINTS = 50_000  # drawn
 
 
-def summary(result: "Reconstruction", model: SparseModel) -> dict[str, Any]:
+def summary(result: Reconstruction, model: SparseModel) -> dict[str, Any]:
     """The content of reconstruction.json: the result's fields, and what the cameras are."""
     fields = asdict(result)
     fields["scene"] = result.scene.name

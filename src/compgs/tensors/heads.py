@@ -7,30 +7,27 @@ and time. `make_heads` chooses, once; names of parameters are those of docs/bits
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from compgs.gaussians import Gaussians
 from compgs.model.head_weights import NETWORKS, HeadDimensions, HeadWeights, Layout
 from compgs.tensors import where
 from compgs.tensors.autograd import PairedPrediction
 from compgs.tensors.linear import Reader
-from compgs.tensors.prediction import Prediction, predict_by_torch
+from compgs.tensors.prediction import Heads, Prediction
 from compgs.tensors.primitives import Primitives
 from compgs.tensors.residual_mlp import ResidualMLP
 
 OPACITY_BIAS = 0.15  # where opacity starts at or below zero no gradient flows
 
 
-class PredictionHeads(nn.Module):
-    """What both kinds of heads can do. `f` [A, reference_dim] are references of anchors, `seen` [A, reference_dim + 4]
-    references and view embeddings, `index` [M] int64, ascending, rows of these for each coupled primitive.
-    """
+class PredictionHeads(Heads):
+    """What both kinds of heads can do."""
 
     layout: Layout
 
@@ -47,34 +44,8 @@ class PredictionHeads(nn.Module):
         return HeadWeights(self.layout, dimensions, tensors)
 
     @abstractmethod
-    def raw_geometry(self, f: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
-        """[M, 10] translation, scaling, quaternion."""
-
-    @abstractmethod
-    def raw_appearance(self, seen: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
-        """[M, 1 or more]: opacity, and after it what the same network says of color, if it says anything."""
-
-    @abstractmethod
-    def raw_color(
-        self, raw: Tensor, chosen: Tensor | None, seen: Tensor, residuals: Tensor, index: Tensor
-    ) -> Tensor:
-        """[M, 3] color of the `chosen` [M] int64 rows of `raw_appearance` (None: of all), whose residuals [M, G] and
-        index [M] are given.
-        """
-
-    @abstractmethod
     def pass_colors(self, mean: Tensor) -> None:
         """The first three reference channels, plus `mean` [3], are the colors' logits, before anything is learned."""
-
-    def predict_drawn(
-        self, primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype = torch.float32
-    ) -> Prediction:
-        """The coupled primitives that are drawn, by the fastest means there are."""
-        return predict_by_torch(self, primitives, seen, appearance_dtype)
-
-    def forward(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """function(heads, *arguments): by way of torch.func.functional_call, with other weights in the heads."""
-        return function(self, *arguments)
 
     def networks(self) -> Iterator[tuple[str, ResidualMLP]]:
         """Yield the networks by the names that the file gives them."""

@@ -12,20 +12,18 @@ Everything runs on any device, in any precision, with gradients; on the CPU in f
 
 import contextlib
 import functools
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.model.constants import CUTOFF_SIGMAS, OPACITY_CUTOFF, SMALLEST_DISTANCE
 from compgs.tensors.primitives import Primitives
-
-if TYPE_CHECKING:
-    from compgs.tensors.heads import PredictionHeads
 
 
 @dataclass(frozen=True)
@@ -146,11 +144,45 @@ def drawn_reach(
     return offsets.norm(dim=-1) + CUTOFF_SIGMAS * scales.amax(-1)
 
 
+class Heads(nn.Module):
+    """The networks that a prediction asks (`tensors/heads.py`).
+
+    `f` [A, reference_dim] are references of anchors, `seen` [A, reference_dim + 4] references and view embeddings,
+    `index` [M] int64, ascending, rows of these for each coupled primitive.
+    """
+
+    @abstractmethod
+    def raw_geometry(self, f: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
+        """[M, 10] translation, scaling, quaternion."""
+
+    @abstractmethod
+    def raw_appearance(self, seen: Tensor, residuals: Tensor, index: Tensor) -> Tensor:
+        """[M, 1 or more]: opacity, and after it what the same network says of color, if it says anything."""
+
+    @abstractmethod
+    def raw_color(
+        self, raw: Tensor, chosen: Tensor | None, seen: Tensor, residuals: Tensor, index: Tensor
+    ) -> Tensor:
+        """[M, 3] color of the `chosen` [M] int64 rows of `raw_appearance` (None: of all), whose residuals [M, G] and
+        index [M] are given.
+        """
+
+    def predict_drawn(
+        self, primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype = torch.float32
+    ) -> Prediction:
+        """The coupled primitives that are drawn, by the fastest means there are."""
+        return predict_by_torch(self, primitives, seen, appearance_dtype)
+
+    def forward(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """function(heads, *arguments): by way of torch.func.functional_call, with other weights in the heads."""
+        return function(self, *arguments)
+
+
 # put together ---------------------------------------------------------------------------------
 
 
 def predict(
-    heads: "PredictionHeads",
+    heads: Heads,
     primitives: Primitives,
     camera_center: Tensor,  # [3] world units
     distance_unit: float,  # world units
@@ -178,22 +210,18 @@ def predict(
     return prediction
 
 
-def _drawn(
-    heads: "PredictionHeads", primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype
-) -> Prediction:
+def _drawn(heads: Heads, primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype) -> Prediction:
     """What is drawn, by the fastest means that the heads have."""
     return heads.predict_drawn(primitives, seen, appearance_dtype)
 
 
-def _all(
-    heads: "PredictionHeads", primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype
-) -> Prediction:
+def _all(heads: Heads, primitives: Primitives, seen: Tensor, appearance_dtype: torch.dtype) -> Prediction:
     """All, drawn or not."""
     return predict_by_torch(heads, primitives, seen, appearance_dtype, compact=False)
 
 
 def predict_by_torch(
-    heads: "PredictionHeads",
+    heads: Heads,
     primitives: Primitives,
     seen: Tensor,  # [N, reference_dim + 4]: references and view embeddings
     appearance_dtype: torch.dtype = torch.float32,
@@ -228,7 +256,7 @@ class Appearance:
 
 
 def predict_appearance(
-    heads: "PredictionHeads",
+    heads: Heads,
     seen: Tensor,  # [A, reference_dim + 4]: references and view embeddings of anchors
     residuals: Tensor,  # [P, residual_dim]
     anchor_index: Tensor,  # [P] int64, ascending: rows of `seen`
@@ -253,7 +281,7 @@ def predict_appearance(
 
 
 def predict_geometry(
-    heads: "PredictionHeads",
+    heads: Heads,
     primitives: Primitives,
     residuals: Tensor,  # [M, residual_dim]
     anchor: Tensor,  # [M] int64, ascending: rows of `primitives`
@@ -268,7 +296,7 @@ def predict_geometry(
     )
 
 
-def geometry_of_all(heads: "PredictionHeads", primitives: Primitives) -> Geometry:
+def geometry_of_all(heads: Heads, primitives: Primitives) -> Geometry:
     """Predict the geometry of all coupled primitives."""
     return Geometry(*predict_geometry(heads, primitives, primitives.residuals, primitives.anchor_index))
 

@@ -11,16 +11,9 @@ from compgs.cameras import Camera
 from compgs.codec import decode
 from compgs.codec.reader import file_info
 from compgs.evaluation.camera_path import whole
-from compgs.formats import (
-    component_bytes,
-    format_of,
-    open_scene,
-    open_tiles,
-    scene_file,
-    scene_name,
-    sog_streamed,
-)
-from compgs.formats.registry import HEAD_BYTES
+from compgs.formats import sog_streamed
+from compgs.formats.tiled_scene import open_tiles
+from compgs.opening import HEAD_BYTES, component_bytes, format_of, open_scene, scene_file, scene_name
 from compgs.render import Renderable
 from compgs.words import size
 

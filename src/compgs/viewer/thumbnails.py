@@ -62,7 +62,7 @@ class Thumbnails:
 
 
 def _found_wrong(file: Path) -> str | None:
-    from compgs.formats import check_scene
+    from compgs.opening import check_scene
 
     try:
         check_scene(file)
@@ -74,8 +74,8 @@ def _found_wrong(file: Path) -> str | None:
 def _drawn(file: Path) -> bytes:
     """Raises BitstreamError."""
     from compgs.evaluation.camera_path import first_view, whole
-    from compgs.formats import open_scene
     from compgs.metrics import to_8bit
+    from compgs.opening import open_scene
     from compgs.render import render
     from compgs.render.render_model import local_camera
 

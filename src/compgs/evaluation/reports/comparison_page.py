@@ -1,16 +1,13 @@
 """The page of a comparison: what two files are in numbers, and their pictures with a line between them."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from compgs.evaluation.compared_files import ComparedView, Comparison
 from compgs.evaluation.reports.page import Picture, folded, heading, page, paragraph, slider
 from compgs.evaluation.reports.pictures import reduced, urls_within
 from compgs.evaluation.reports.tables import Column, Table, to_html
-
-if TYPE_CHECKING:
-    from compgs.evaluation.comparison import ComparedView, Comparison
 
 SHOWN_VIEWS = 8  # with pictures, those that differ most
 WIDTH = 800  # pixels of a picture, at most
@@ -24,27 +21,27 @@ class ComparisonPage:
         self._names = self._apart(a, b)
         self._kept: list[_Kept] = []
 
-    def keep(self, row: "ComparedView", pictures: dict[str, np.ndarray]) -> None:
+    def keep(self, row: ComparedView, pictures: dict[str, np.ndarray]) -> None:
         """Keep the pictures of one view: `a`, `b`, `difference` and perhaps `gt`, the photograph."""
         height, width = pictures["a"].shape[:2]
         small = {name: reduced(picture, WIDTH) for name, picture in pictures.items()}
         self._kept.append(_Kept(row, small, width, height))
         self._kept = sorted(self._kept, key=lambda kept: kept.row.psnr)[:SHOWN_VIEWS]
 
-    def html(self, found: "Comparison") -> bytes:
+    def html(self, found: Comparison) -> bytes:
         """The page, of what was found in the end."""
         return page(
             f"{found.a.file} and {found.b.file}",
             "".join([*map(paragraph, found.in_words()), *self._tables(found), *self._figures(found)]),
         )
 
-    def _tables(self, found: "Comparison") -> list[str]:
+    def _tables(self, found: Comparison) -> list[str]:
         return [
             to_html(files_table(found, *self._names)),
             *(paragraph(f"Note: {note}.", "note") for note in found.notes),
         ]
 
-    def _figures(self, found: "Comparison") -> list[str]:
+    def _figures(self, found: Comparison) -> list[str]:
         left = len(found.per_view) - len(self._kept)
         parts = [heading("Pictures, those that differ most first")]
         labels = {"a": self._names[0], "b": self._names[1], "gt": "photograph"}
@@ -73,13 +70,13 @@ class ComparisonPage:
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    row: "ComparedView"
+    row: ComparedView
     pictures: dict[str, np.ndarray]  # [H, W, 3] uint8, reduced to WIDTH
     width: int  # pixels, before
     height: int
 
 
-def view_in_words(row: "ComparedView", names: tuple[str, str]) -> str:
+def view_in_words(row: ComparedView, names: tuple[str, str]) -> str:
     """Below the pictures of a view."""
     parts = []
     if row.a_psnr is not None and row.b_psnr is not None:
@@ -98,7 +95,7 @@ def _db(psnr: float) -> str:
     return "identical" if psnr == float("inf") else f"{psnr:.2f} dB"
 
 
-def files_table(found: "Comparison", a: str, b: str) -> Table:
+def files_table(found: Comparison, a: str, b: str) -> Table:
     """Both files, a row each, and how the second compares with the first."""
     columns = (
         Column("file", "file"),
@@ -133,7 +130,7 @@ def files_table(found: "Comparison", a: str, b: str) -> Table:
     return Table("files", "Files", columns, rows, (where,)).without_empty_columns()
 
 
-def views_table(found: "Comparison", a: str, b: str) -> Table:
+def views_table(found: Comparison, a: str, b: str) -> Table:
     """All views, those that differ most first."""
     columns = (
         Column("view", "view"),
@@ -154,7 +151,7 @@ def views_table(found: "Comparison", a: str, b: str) -> Table:
     return Table("views", "Views", columns, rows).without_empty_columns()
 
 
-def components_table(found: "Comparison") -> Table:
+def components_table(found: Comparison) -> Table:
     """Bytes of each file by component."""
     columns = (Column("file", "file"), Column("component", "component"), Column("bytes", "bytes", ",.0f"))
     rows = tuple((f.file, name, count) for f in (found.a, found.b) for name, count in f.components.items())

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from compgs.config import Config
 from compgs.methods.anchors.networks import ViewNetworks
 from compgs.methods.anchors.prediction import AnchorValues
-from compgs.methods.anchors.scene import AnchorScene, Frame
+from compgs.published.anchors import AnchorScene, Frame
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.training.start import anchor_grid, anchor_spacing

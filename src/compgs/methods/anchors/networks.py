@@ -6,8 +6,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from compgs.methods.anchors.scene import NETWORKS, tensor_name
 from compgs.model.constants import VIEW_DIM
+from compgs.published.anchors import NETWORKS, tensor_name
 from compgs.tensors.linear import linear
 
 OPACITY_BIAS = 0.15  # where opacity starts at or below zero no gradient flows

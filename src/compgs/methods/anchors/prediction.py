@@ -9,8 +9,8 @@ from torch import Tensor
 
 from compgs.gaussians import Gaussians
 from compgs.methods.anchors.networks import applied
-from compgs.methods.anchors.scene import Frame
 from compgs.model.constants import CUTOFF_SIGMAS
+from compgs.published.anchors import Frame
 from compgs.tensors import where
 from compgs.tensors.prediction import Prediction, is_drawn, see
 

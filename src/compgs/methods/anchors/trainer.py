@@ -11,7 +11,7 @@ from compgs.config import Config
 from compgs.errors import ConfigError
 from compgs.methods.anchors.model import AnchorModel, control_settings, initial_anchors
 from compgs.methods.anchors.prediction import AnchorValues, predict_anchors
-from compgs.methods.anchors.scene import Frame
+from compgs.published.anchors import Frame
 from compgs.render import RasterResult, RasterSettings, Renderable
 from compgs.scene.points import COORDINATE_BITS
 from compgs.scene.views import Scene

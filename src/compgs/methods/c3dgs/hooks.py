@@ -7,26 +7,26 @@ import torch
 from torch import Tensor, nn
 
 from compgs.formats.packed import Packed
-from compgs.methods.c3dgs import C3DGSConfig
-from compgs.methods.c3dgs.files import (
+from compgs.methods.c3dgs.sensitivity import sensitivities
+from compgs.methods.c3dgs.settings import C3DGSConfig
+from compgs.methods.c3dgs.shapes import covariances, scales_and_rotations
+from compgs.methods.parts.books import entries_within
+from compgs.methods.parts.fake_quantization import fake_half, fake_levels
+from compgs.methods.parts.vector_quantization import averaged_codes, first_codes, nearest_codes
+from compgs.published.c3dgs import (
     SPLAT_BYTES,
     THINNEST,
     Shared,
     entry_bytes,
     packed_splats,
 )
-from compgs.methods.c3dgs.sensitivity import sensitivities
-from compgs.methods.c3dgs.shapes import covariances, scales_and_rotations
-from compgs.methods.parts.books import entries_within
-from compgs.methods.parts.fake_quantization import fake_half, fake_levels
-from compgs.methods.parts.vector_quantization import averaged_codes, first_codes, nearest_codes
 from compgs.tensors.splats import Splats
 from compgs.training.plan import PRUNED_BY
 from compgs.training.splats.hooks import Hooks
 from compgs.training.structure.importance import spread
 
 if TYPE_CHECKING:
-    from compgs.training.splats.trainer import SplatTrainer
+    from compgs.training.splats.hooks import SplatRun
 
 SEED = 12  # of the first codes, beside the run's
 OPACITY_MARGIN = 1e-6  # as where the file is read (`compgs.formats.arrays`)
@@ -65,7 +65,7 @@ class SharedEntries(Hooks):
     # codebooks -----------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def begin(self, trainer: "SplatTrainer") -> None:
+    def begin(self, trainer: "SplatRun") -> None:
         cameras = [view.camera for view in spread(trainer.scene.train_views, PRUNED_BY)]
         of_colors, of_shapes = sensitivities(trainer.parameters.trained(), cameras, trainer.settings)
         seen = of_colors > 0
@@ -108,7 +108,7 @@ class SharedEntries(Hooks):
 
     # fine-tuning ---------------------------------------------------------------------------------------------------
 
-    def transform(self, splats: Splats, trainer: "SplatTrainer") -> Splats:
+    def transform(self, splats: Splats, trainer: "SplatRun") -> Splats:
         positive = torch.nn.functional.normalize(fake_levels(self.scales).relu(), dim=1, eps=1e-12)
         log_shapes = positive.clamp_min(THINNEST).log()
         rest = fake_levels(self.rest) if self.rest.numel() else self.rest
@@ -122,13 +122,13 @@ class SharedEntries(Hooks):
             rest=rest[self.colors],
         )
 
-    def estimated_bytes(self, trainer: "SplatTrainer") -> int:
+    def estimated_bytes(self, trainer: "SplatRun") -> int:
         """Estimate the bytes before DEFLATE."""
         entries = (self.dc, self.rest, self.scales, self.quaternions)
         return SPLAT_BYTES * len(trainer.parameters) + sum(entry.numel() for entry in entries)
 
     @torch.no_grad()
-    def content(self, trainer: "SplatTrainer") -> Packed:
+    def content(self, trainer: "SplatRun") -> Packed:
         """Return the content of the file, after the last step."""
         splats = trainer.parameters.trained()
         tensors = {

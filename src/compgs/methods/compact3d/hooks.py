@@ -8,23 +8,23 @@ from torch import Tensor
 
 from compgs.config import TrainingConfig
 from compgs.formats.packed import Packed
-from compgs.methods.compact3d import Compact3DSection
-from compgs.methods.compact3d.files import (
+from compgs.methods.compact3d.settings import Compact3DSection
+from compgs.methods.parts.books import entries_within
+from compgs.methods.parts.fake_quantization import straight_through
+from compgs.methods.parts.vector_quantization import code_means, first_codes, k_means
+from compgs.model.degrees import degree_of
+from compgs.published.compact3d import (
     LABELED,
     SORTED,
     codebook_bytes,
     packed_splats,
     splat_bytes,
 )
-from compgs.methods.parts.books import entries_within
-from compgs.methods.parts.fake_quantization import straight_through
-from compgs.methods.parts.vector_quantization import code_means, first_codes, k_means
-from compgs.model.degrees import degree_of
 from compgs.tensors.splats import Splats
 from compgs.training.splats.hooks import Drawn, Hooks
 
 if TYPE_CHECKING:
-    from compgs.training.splats.trainer import SplatTrainer
+    from compgs.training.splats.hooks import SplatRun
 
 CODED = (*LABELED, SORTED)
 LEAST_EVERY = 20  # steps between two assignments in short runs: in fewer, values hardly move to other codes
@@ -51,7 +51,7 @@ class LearnedCodebooks(Hooks):
         self.penalty = range(*(round(share * steps) for share in section.opacity_steps))
         self.prune_every = max(1, round(section.prune_every * steps))
 
-    def begin(self, trainer: "SplatTrainer") -> None:
+    def begin(self, trainer: "SplatRun") -> None:
         splats = trainer.parameters.trained()
         for name in CODED:
             values = getattr(splats, name).flatten(1)
@@ -61,20 +61,20 @@ class LearnedCodebooks(Hooks):
         self.to(trainer.device)
         self.after_step(trainer)
 
-    def transform(self, splats: Splats, trainer: "SplatTrainer") -> Splats:
+    def transform(self, splats: Splats, trainer: "SplatRun") -> Splats:
         drawn = {}
         for name, codes in self.codes(splats).items():
             values = getattr(splats, name)
             drawn[name] = straight_through(values, codes[self.labels(name)].view_as(values))
         return replace(splats, **drawn)
 
-    def loss(self, drawn: Drawn, trainer: "SplatTrainer") -> Tensor | None:
+    def loss(self, drawn: Drawn, trainer: "SplatRun") -> Tensor | None:
         if trainer.step not in self.penalty or not self.section.opacity_weight:
             return None
         total = drawn.splats.opacity_logits.sigmoid().sum()
         return self.section.opacity_weight / max(1, int(self.penalized)) * total
 
-    def after_step(self, trainer: "SplatTrainer") -> None:
+    def after_step(self, trainer: "SplatRun") -> None:
         step = trainer.step
         if step == self.penalty.start:
             self.penalized.fill_(len(trainer.parameters))
@@ -85,14 +85,14 @@ class LearnedCodebooks(Hooks):
             self.assign(trainer)
 
     @torch.no_grad()
-    def prune(self, trainer: "SplatTrainer") -> None:
+    def prune(self, trainer: "SplatRun") -> None:
         """Remove what is transparent."""
         kept = trainer.parameters.opacity_logits.sigmoid() >= trainer.config.splats.prune_opacity
         if kept.any() and not kept.all():
             trainer.keep(kept)
 
     @torch.no_grad()
-    def assign(self, trainer: "SplatTrainer") -> None:
+    def assign(self, trainer: "SplatRun") -> None:
         """Labels anew; the first time, codes too."""
         splats = trainer.parameters.trained()
         rounds = self.section.rounds
@@ -137,14 +137,14 @@ class LearnedCodebooks(Hooks):
             if codes.numel()
         }
 
-    def estimated_bytes(self, trainer: "SplatTrainer") -> int:
+    def estimated_bytes(self, trainer: "SplatRun") -> int:
         count, degree = len(trainer.parameters), degree_of(trainer.parameters.rest.shape[1])
         codes = self.counts(count, degree)
         k, rest = codes[SORTED], codes.get("rest", 1)
         per_splat = splat_bytes(k, rest, degree, bit_quantized=self.section.bit_quantized)
         return round(count * per_splat) + codebook_bytes(k, rest, degree)
 
-    def content(self, trainer: "SplatTrainer") -> Packed:
+    def content(self, trainer: "SplatRun") -> Packed:
         """Return the content of the file, after the last step."""
         splats = trainer.parameters.trained()
         codes = self.codes(splats)

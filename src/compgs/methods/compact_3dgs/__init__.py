@@ -6,71 +6,16 @@
 What is as published, what is not and why: docs/methods/compact-3dgs.md.
 """
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from compgs.config import Config, LearningRate, Positive, Range, Share, SplatConfig
+from compgs.methods.compact_3dgs.settings import SCALED, CompactConfig
 from compgs.methods.method import PACKED_SUFFIX, SPLAT_SETTINGS, Method, write_itself
 
 if TYPE_CHECKING:
-    from compgs.devices import Device
-    from compgs.formats.packed import Packed
-    from compgs.methods.compact_3dgs.file import NetworkColored
-    from compgs.methods.parts.content import Content
     from compgs.model.splats import SplatModel
+    from compgs.published.parts.content import Content
     from compgs.scene.views import Scene
     from compgs.training.run.run import Run
-
-MOST_LEVELS, MOST_FEATURES, MOST_CELLS, MOST_TABLE_BITS = 32, 8, 1 << 14, 24
-
-
-@dataclass(frozen=True)
-class CompactSection:
-    """Settings of the authors' release; schedules as fractions of its 30 000 steps."""
-
-    # weight of the mean mask in the loss: the rate
-    mask_weight: Annotated[float, Range(0, 1e3)] = 5e-4
-    mask_lr: LearningRate = 0.01
-    # masks at or below it hide their splats, which are then removed
-    mask_threshold: Annotated[float, Range(0, 1, above=True, below=True)] = 0.01
-    # of the steps between two removals, once growth has ended (1 000 of 30 000)
-    mask_every: Annotated[float, Range(0, 1, above=True)] = 1 / 30
-    # levels of the hash grid
-    grid_levels: Annotated[int, Range(1, MOST_LEVELS)] = 16
-    # numbers of an entry
-    grid_features: Annotated[int, Range(1, MOST_FEATURES)] = 2
-    # cells an axis of the coarsest level, and how many times more each finer one has
-    grid_base: Annotated[int, Range(1, 1 << 10)] = 16
-    grid_growth: Annotated[float, Range(1, 4)] = 1.447
-    # log2 of the entries that a level may have
-    grid_bits: Annotated[int, Range(4, MOST_TABLE_BITS)] = 19
-    # of grid and network; a third of it from each of `color_lr_falls` on
-    color_lr: LearningRate = 0.01
-    color_lr_falls: Annotated[tuple[float, ...], Range(0, 1)] = (1 / 6, 1 / 2, 5 / 6)
-    # of the steps: codebooks of scales and rotations begin
-    codes_start: Share = 29 / 30
-    # codebooks one after the other, and codes of each
-    code_stages: Annotated[int, Range(1, 16)] = 6
-    codes: Annotated[int, Range(2, 1 << 12)] = 64
-    # of the codes
-    codes_lr: Positive = 1e-4
-
-
-def _splats() -> SplatConfig:
-    return SplatConfig(harmonics=0)
-
-
-@dataclass(frozen=True)
-class CompactConfig(Config):
-    """Splats have no harmonics: the network is their color."""
-
-    splats: SplatConfig = field(default_factory=_splats)
-    compact: CompactSection = field(default_factory=CompactSection)
-
-
-# For small scenes and short runs: a grid of 0.1 MB, not of 25 MB, and masks that can get from 1 to the threshold (560
-# steps away at the published rate) in the time there is.
-SCALED = {"grid_bits": 11, "mask_lr": 0.1}
 
 
 def train(scene: "Scene", config: CompactConfig, run: "Run", start: "SplatModel | None" = None) -> "Content":
@@ -78,12 +23,6 @@ def train(scene: "Scene", config: CompactConfig, run: "Run", start: "SplatModel 
     from compgs.methods.compact_3dgs.hooks import train_compact
 
     return train_compact(scene, config, run)
-
-
-def open_file(packed: "Packed", device: "Device", background: tuple[float, float, float]) -> "NetworkColored":
-    from compgs.methods.compact_3dgs.file import opened
-
-    return opened(packed, device, background)
 
 
 COMPACT_3DGS = Method(
@@ -94,7 +33,6 @@ COMPACT_3DGS = Method(
     uses=(*SPLAT_SETTINGS, "compact"),
     train=train,
     write=write_itself,
-    open=open_file,
     settings=CompactConfig,
     presets={"scaled": {"compact": SCALED}},
 )

@@ -9,17 +9,17 @@ from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.losses import COMMON_EXTENT, Target
-from compgs.methods.compact_3dgs import CompactConfig
-from compgs.methods.compact_3dgs.color_network import ColorNetwork, network_shapes
-from compgs.methods.compact_3dgs.file import SMALLEST_SCALE, Shapes, compact_content
-from compgs.methods.compact_3dgs.hash_grid import GridLayout
+from compgs.methods.compact_3dgs.settings import CompactConfig
 from compgs.methods.compact_3dgs.tensors import color_coefficients
-from compgs.methods.parts.content import Content
 from compgs.methods.parts.fake_quantization import straight_through
 from compgs.methods.parts.vector_quantization import residual_codes, residual_labels, residual_sums
+from compgs.published.compact_3dgs.color_network import ColorNetwork, network_shapes
+from compgs.published.compact_3dgs.file import SMALLEST_SCALE, Shapes, compact_content
+from compgs.published.compact_3dgs.hash_grid import GridLayout
+from compgs.published.parts.content import Content
 from compgs.scene.views import Scene
 from compgs.tensors.splats import Splats
-from compgs.training import Drawn, Hooks, Phase, Run, SplatTrainer, train_phases
+from compgs.training import Drawn, Hooks, Phase, Run, SplatRun, train_phases
 from compgs.training.optimizers import rates_for
 from compgs.training.splats.trainer import HOOKS
 
@@ -81,10 +81,10 @@ class Compact(Hooks):
 
     # a step -----------------------------------------------------------------------------------------------------------
 
-    def begin(self, trainer: SplatTrainer) -> None:
+    def begin(self, trainer: SplatRun) -> None:
         self.masks = nn.Parameter(torch.full((len(trainer.parameters),), FIRST_MASK))
 
-    def view(self, camera: Camera, photograph: Target, trainer: SplatTrainer) -> tuple[Camera, Target]:
+    def view(self, camera: Camera, photograph: Target, trainer: SplatRun) -> tuple[Camera, Target]:
         self.camera = camera
         fallen = sum(trainer.progress >= at for at in self.config.color_lr_falls)
         rate = self.config.color_lr * FALL**fallen
@@ -94,7 +94,7 @@ class Compact(Hooks):
                 group["rates"] = rates
         return camera, photograph
 
-    def transform(self, splats: Splats, trainer: SplatTrainer) -> Splats:
+    def transform(self, splats: Splats, trainer: SplatRun) -> Splats:
         splats = self.with_codes(self.masked(splats))
         return replace(splats, dc=self.colors(splats, trainer))
 
@@ -111,7 +111,7 @@ class Compact(Hooks):
             log_scales=splats.log_scales + change[:, None],
         )
 
-    def colors(self, splats: Splats, trainer: SplatTrainer) -> Tensor:
+    def colors(self, splats: Splats, trainer: SplatRun) -> Tensor:
         """[M, 3] coefficients of degree 0: of the network, for the splats that the camera may see."""
         found = torch.zeros_like(splats.dc)
         if self.camera is None:
@@ -144,35 +144,35 @@ class Compact(Hooks):
             quaternions=straight_through(splats.quaternions, drawn[1]),
         )
 
-    def loss(self, drawn: Drawn, trainer: SplatTrainer) -> Tensor:
+    def loss(self, drawn: Drawn, trainer: SplatRun) -> Tensor:
         """What a splat costs, and what the codebooks miss."""
         penalty = self.config.mask_weight * self.masks.sigmoid().mean()
         return penalty if self.error is None else penalty + self.error
 
     # between steps ----------------------------------------------------------------------------------------------------
 
-    def densified(self, trainer: SplatTrainer) -> None:
+    def densified(self, trainer: SplatRun) -> None:
         self.remove_hidden(trainer)
 
-    def after_step(self, trainer: SplatTrainer) -> None:
+    def after_step(self, trainer: SplatRun) -> None:
         if trainer.step >= trainer.schedule.stop and trainer.step % self.prune_every == 0:
             self.remove_hidden(trainer)
         if trainer.step == self.codes_at and not self.coded:
             self.begin_codes(trainer)
 
-    def finish(self, trainer: SplatTrainer) -> None:
+    def finish(self, trainer: SplatRun) -> None:
         self.remove_hidden(trainer)
         if not self.coded:
             self.begin_codes(trainer)
 
     @torch.no_grad()
-    def remove_hidden(self, trainer: SplatTrainer) -> None:
+    def remove_hidden(self, trainer: SplatRun) -> None:
         """Splats whose masks hide them are gone for good."""
         kept = self.masks.sigmoid() > self.config.mask_threshold
         if kept.any() and not kept.all():
             trainer.keep(kept)
 
-    def begin_codes(self, trainer: SplatTrainer) -> None:
+    def begin_codes(self, trainer: SplatRun) -> None:
         """Codebooks of the scales and rotations there are."""
         c = self.config
         for name, vectors in zip(
@@ -183,7 +183,7 @@ class Compact(Hooks):
             setattr(self, f"{name}_codes", nn.Parameter(books))
         trainer.train_hooks()
 
-    def estimated_bytes(self, trainer: SplatTrainer) -> int:
+    def estimated_bytes(self, trainer: SplatRun) -> int:
         c = self.config
         bits = 2 * c.code_stages * (c.codes - 1).bit_length()
         weights = sum(weights.numel() for weights in self.weights)

@@ -5,8 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from compgs.methods.compact_3dgs.color_network import DIRECTION_DEGREE
-from compgs.methods.compact_3dgs.hash_grid import PRIMES, GridLayout, grid_features, grid_gradient
+from compgs.published.compact_3dgs.color_network import DIRECTION_DEGREE
+from compgs.published.compact_3dgs.hash_grid import PRIMES, GridLayout, grid_features, grid_gradient
 from compgs.tensors import where
 from compgs.tensors.spherical_harmonics import harmonic_basis
 

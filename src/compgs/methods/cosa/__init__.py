@@ -11,9 +11,6 @@ from compgs.methods.cosa.settings import PRESETS, SETTINGS, CosaConfig
 from compgs.methods.method import PACKED_SUFFIX, Method
 
 if TYPE_CHECKING:
-    from compgs.devices import Device
-    from compgs.formats.packed import Packed
-    from compgs.methods.anchors.scene import AnchorScene
     from compgs.methods.cosa.model import CosaModel
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
@@ -33,14 +30,6 @@ def _write(model: "CosaModel", path: Path, config: CosaConfig) -> int:
     return write(model, path)
 
 
-def _open(packed: "Packed", device: "Device", background: tuple[float, float, float]) -> "AnchorScene":
-    """Drawn by the CPU, on whatever device."""
-    from compgs.methods.cosa.content import scene_of
-    from compgs.methods.cosa.reader import content_of
-
-    return scene_of(content_of(packed))
-
-
 COSA = Method(
     name="cosa-gs",
     description="anchors in a causal chain, bits of the whole scene in the loss",
@@ -49,7 +38,6 @@ COSA = Method(
     uses=SETTINGS,
     train=_train,
     write=_write,
-    open=_open,
     settings=CosaConfig,
     presets=PRESETS,
 )

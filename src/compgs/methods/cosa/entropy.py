@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from compgs.entropy.gaussian import gaussian_bits
 from compgs.entropy.network import EntropyNetwork, leaky, round_fixed
 from compgs.entropy.quantization import quantize, quantize_weight, round_straight_through
-from compgs.methods.cosa.shape import GROUPS, ChainShape
+from compgs.published.cosa.shape import GROUPS, ChainShape
 from compgs.tensors.linear import linear
 
 Noise = Callable[[Tensor], Tensor]

@@ -4,17 +4,21 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from compgs.codec.encoder import quantized_tensor
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.entropy.network import EntropyNetwork
 from compgs.entropy.quantization import quantize_weight, weight_exponent
+from compgs.errors import NotEncodable
 from compgs.methods.anchors.model import AnchorModel
 from compgs.methods.anchors.prediction import AnchorValues
-from compgs.methods.anchors.scene import AnchorScene, Frame
-from compgs.methods.cosa.chain import coordinate_inputs
 from compgs.methods.cosa.entropy import CausalChain, Chained, ContextNetwork, Noise
+from compgs.methods.cosa.rounding import Rounding, integers
 from compgs.methods.cosa.settings import CosaConfig
-from compgs.methods.cosa.shape import ChainShape
-from compgs.ordering.order import octree_depth, octree_origin
+from compgs.ordering.order import canonical_order, octree_depth, octree_origin
+from compgs.published.anchors import AnchorScene, Frame
+from compgs.published.cosa.chain import coordinate_inputs, walk
+from compgs.published.cosa.content import CosaContent, scene_of
+from compgs.published.cosa.shape import GROUPS, ChainShape
 from compgs.training.rate.file_size import OTHER_BYTES, gaussian_entropy
 
 NOT_BEGUN = -1  # depth of the cube while there is no rate
@@ -159,10 +163,45 @@ class CosaModel(AnchorModel):
         """What the file would show."""
         if not self.begun:
             return super().as_hybrid_model()
-        from compgs.methods.cosa.content import scene_of
-        from compgs.methods.cosa.writer import content_of
+        return scene_of(self.content())
 
-        return scene_of(content_of(self))
+    @torch.no_grad()
+    def content(self) -> CosaContent:
+        """All that the file holds, as integers. Raises NotEncodable for what has diverged, or has nothing left."""
+        for name, parameter in self.named_parameters():
+            if not torch.isfinite(parameter).all():
+                raise NotEncodable(f"{name} holds values that are not finite: the training has diverged")
+        mask = self.kept().cpu().numpy()
+        rows = np.flatnonzero(mask.any(1))
+        if not len(rows):
+            raise NotEncodable("all primitives are masked: there is nothing to encode")
+        coordinates = self.coordinates.cpu().numpy()
+        rows = rows[canonical_order(coordinates[rows])]
+        coordinates, mask = coordinates[rows], mask[rows]
+        networks = {
+            name: integers(n, self.config.cosa.network_bits) for name, n in self.chain.networks.items()
+        }
+        steps = {group: float(np.float32(self.chain.step(group).item())) for group in GROUPS}
+        y = {g: v.detach().cpu().double().numpy()[rows] / steps[g] for g, v in self.natural().items()}
+        y["offset"] = y["offset"].reshape(*mask.shape, 3)[mask]
+        coded = Rounding(y)
+        places = coordinate_inputs(coordinates, self.origin.cpu().numpy(), int(self.depth))
+        latents = walk(self.chain.shape, networks, places, mask, coded)
+        corner_x, corner_y, corner_z = (int(v) for v in self.origin)
+        return CosaContent(
+            shape=self.chain.shape,
+            frame=self.frame,
+            steps=steps,
+            origin=(corner_x, corner_y, corner_z),
+            depth=int(self.depth),
+            coordinates=coordinates,
+            mask=mask,
+            networks=networks,
+            latents=latents,
+            symbols=tuple(coded.symbols),
+            tables=tuple(coded.tables),
+            weights={n: quantized_tensor(w, self.weight_bits(w)) for n, w in self.networks.weights().items()},
+        )
 
 
 def _stored_bits(weight: Tensor, bits: int) -> float:

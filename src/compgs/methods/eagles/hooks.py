@@ -14,15 +14,15 @@ from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.losses import Target
-from compgs.methods.eagles import EaglesConfig
-from compgs.methods.eagles.file import Code, cosines, latent_content
-from compgs.methods.parts.content import Content
+from compgs.methods.eagles.settings import EaglesConfig
 from compgs.methods.parts.fake_quantization import straight_through
 from compgs.methods.parts.significance import all_but_lowest, view_significance
 from compgs.model.degrees import harmonics_above_dc
+from compgs.published.eagles import Code, cosines, latent_content
+from compgs.published.parts.content import Content
 from compgs.scene.views import Scene
 from compgs.tensors.splats import Splats
-from compgs.training import Hooks, Phase, Run, SplatTrainer, train_phases
+from compgs.training import Hooks, Phase, Run, SplatRun, train_phases
 from compgs.training.optimizers import rates_for, replace_parameter
 from compgs.training.plan import PRUNED_BY
 from compgs.training.shortcuts.coarse import smaller
@@ -122,13 +122,13 @@ class Latents(Hooks):
 
     # a run ------------------------------------------------------------------------------------------------------------
 
-    def begin(self, trainer: SplatTrainer) -> None:
+    def begin(self, trainer: SplatRun) -> None:
         splats = trainer.parameters.splats()
         for a in self.attributes:
             latents = self.encode(a.name, getattr(splats, a.field).detach())
             setattr(self, f"{a.name}_latents", nn.Parameter(latents))
 
-    def view(self, camera: Camera, photograph: Target, trainer: SplatTrainer) -> tuple[Camera, Target]:
+    def view(self, camera: Camera, photograph: Target, trainer: SplatRun) -> tuple[Camera, Target]:
         """A smaller image in the first part of the run."""
         self.follow_decoders(trainer)
         small = self.sized(camera, trainer.progress)
@@ -141,7 +141,7 @@ class Latents(Hooks):
         scale = image_scale(progress, e.smallest_image, e.coarse_until)
         return camera.resized(*(max(1, round(scale * side)) for side in (camera.width, camera.height)))
 
-    def follow_decoders(self, trainer: SplatTrainer) -> None:
+    def follow_decoders(self, trainer: SplatRun) -> None:
         """The latents' learning rates go with the decoders."""
         groups = {group["name"]: group for group in trainer.optimizer.param_groups}
         for attribute in self.attributes:
@@ -149,11 +149,11 @@ class Latents(Hooks):
             rates = rates_for(self.config.training.views_per_step, (rate, rate))
             groups[f"{HOOKS}{attribute.name}_latents"]["rates"] = rates
 
-    def transform(self, splats: Splats, trainer: SplatTrainer) -> Splats:
+    def transform(self, splats: Splats, trainer: SplatRun) -> Splats:
         return replace(splats, **self.decode())
 
     @torch.no_grad()
-    def after_step(self, trainer: SplatTrainer) -> None:
+    def after_step(self, trainer: SplatRun) -> None:
         if trainer.schedule.reset_due(trainer.step):
             self.take_opacities(trainer)
         if trainer.step in self.prune_at:
@@ -161,7 +161,7 @@ class Latents(Hooks):
         for field, value in self.decode().items():
             getattr(trainer.parameters, field).copy_(value)
 
-    def take_opacities(self, trainer: SplatTrainer) -> None:
+    def take_opacities(self, trainer: SplatRun) -> None:
         """The opacities of the splats were reset: their latents follow."""
         logits = trainer.parameters.opacity_logits.detach()
         replace_parameter(
@@ -172,14 +172,14 @@ class Latents(Hooks):
             torch.zeros_like,
         )
 
-    def influential(self, trainer: SplatTrainer) -> Tensor:
+    def influential(self, trainer: SplatRun) -> Tensor:
         """[M] bool: all but the share of the splats that add least to the training views."""
         cameras = [view.camera for view in spread(trainer.scene.train_views, PRUNED_BY)]
         added = view_significance(trainer.as_drawn(), cameras, trainer.settings)
         return all_but_lowest(added, self.config.eagles.prune_share)
 
     @torch.no_grad()
-    def estimated_bytes(self, trainer: SplatTrainer) -> int:
+    def estimated_bytes(self, trainer: SplatRun) -> int:
         """Estimate the bytes by the entropy of each attribute's histogram."""
         symbols = (self.latents(a.name).round().view(-1) for a in self.attributes)
         bits = sum(_entropy_bits(values) for values in symbols)

@@ -10,12 +10,12 @@ from torch import Tensor
 from compgs.cameras import Camera
 from compgs.formats.packed import Packed
 from compgs.losses import Target
-from compgs.methods.lightgaussian import LightGaussianConfig, LightGaussianSection
-from compgs.methods.lightgaussian.files import codebook_bytes, packed_splats, splat_bytes
+from compgs.methods.lightgaussian.settings import LightGaussianConfig, LightGaussianSection
 from compgs.methods.parts.books import entries_within
 from compgs.methods.parts.significance import all_but_lowest, view_significance
 from compgs.methods.parts.vector_quantization import averaged_codes, first_codes, nearest_codes
 from compgs.model.degrees import degree_of, harmonics_above_dc
+from compgs.published.lightgaussian import codebook_bytes, packed_splats, splat_bytes
 from compgs.tensors.rasterize import rasterize
 from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
 from compgs.tensors.visibility import visible_mask
@@ -24,7 +24,7 @@ from compgs.training.splats.hooks import Hooks
 from compgs.training.structure.importance import spread
 
 if TYPE_CHECKING:
-    from compgs.training.splats.trainer import SplatTrainer
+    from compgs.training.splats.hooks import SplatRun
 
 SEED = 13  # of the first codes, beside the run's
 LARGE = 0.9  # of the splats are not smaller than the one whose volume counts as 1
@@ -39,12 +39,12 @@ class Pruned(Hooks):
         self.section = section
         self.slowing = section.settled_slowing
 
-    def begin(self, trainer: "SplatTrainer") -> None:
+    def begin(self, trainer: "SplatRun") -> None:
         kept = all_but_lowest(significance(trainer, self.section.volume_power), self.section.prune)
         if not kept.all():
             trainer.keep(kept)
 
-    def estimated_bytes(self, trainer: "SplatTrainer") -> int:
+    def estimated_bytes(self, trainer: "SplatRun") -> int:
         return estimated_bytes(trainer, self.section)
 
 
@@ -60,14 +60,14 @@ class Distilled(Hooks):
         self.seed = seed
         self.slowing = section.distilled_slowing
 
-    def begin(self, trainer: "SplatTrainer") -> None:
+    def begin(self, trainer: "SplatRun") -> None:
         for name, value in vars(trainer.parameters.trained()).items():
             self.register_buffer(f"teacher_{name}", value)
 
     def teacher(self) -> Splats:
         return Splats(**{name: getattr(self, f"teacher_{name}") for name in Splats.__dataclass_fields__})
 
-    def view(self, camera: Camera, photograph: Target, trainer: "SplatTrainer") -> tuple[Camera, Target]:
+    def view(self, camera: Camera, photograph: Target, trainer: "SplatRun") -> tuple[Camera, Target]:
         camera = self.aside(camera, trainer.step, trainer.scene.extent)
         with torch.no_grad():
             teacher = self.teacher()
@@ -83,7 +83,7 @@ class Distilled(Hooks):
         chance = np.random.default_rng((self.seed, step))
         return camera.moved(self.section.jitter * extent * chance.normal(size=3))
 
-    def transform(self, splats: Splats, trainer: "SplatTrainer") -> Splats:
+    def transform(self, splats: Splats, trainer: "SplatRun") -> Splats:
         kept = harmonics_above_dc(self.section.degree)
         above = torch.zeros_like(splats.rest[:, kept:])
         return replace(
@@ -92,12 +92,12 @@ class Distilled(Hooks):
             rest=torch.cat([splats.rest[:, :kept], above], 1),
         )
 
-    def estimated_bytes(self, trainer: "SplatTrainer") -> int:
+    def estimated_bytes(self, trainer: "SplatRun") -> int:
         return estimated_bytes(trainer, self.section)
 
 
 @torch.no_grad()
-def significance(trainer: "SplatTrainer", volume_power: float) -> Tensor:
+def significance(trainer: "SplatRun", volume_power: float) -> Tensor:
     """[M] float64: blending weights over the training views, times a power of the splats' volumes.
 
     A volume counts in those of the splat that LARGE of all splats are not smaller than.
@@ -119,7 +119,7 @@ def entries(section: LightGaussianSection, splats: int, degree: int) -> int:
     )
 
 
-def estimated_bytes(trainer: "SplatTrainer", section: LightGaussianSection) -> int:
+def estimated_bytes(trainer: "SplatRun", section: LightGaussianSection) -> int:
     """Estimate the bytes before DEFLATE."""
     count = len(trainer.parameters)
     degree = min(section.degree, degree_of(trainer.parameters.rest.shape[1]))
@@ -128,7 +128,7 @@ def estimated_bytes(trainer: "SplatTrainer", section: LightGaussianSection) -> i
 
 
 @torch.no_grad()
-def content(trainer: "SplatTrainer", config: LightGaussianConfig) -> Packed:
+def content(trainer: "SplatRun", config: LightGaussianConfig) -> Packed:
     """Return the content of the file, after the last step."""
     section, device = config.lightgaussian, trainer.device
     splats = trainer.parameters.trained()

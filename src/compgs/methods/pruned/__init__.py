@@ -16,7 +16,7 @@ from compgs.methods.splats import SOG, SPZ, check_near
 if TYPE_CHECKING:
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
-    from compgs.training.run.loop import Run
+    from compgs.training.run.run import Run
 
 SECTION = "pruned"
 

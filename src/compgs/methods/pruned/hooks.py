@@ -8,7 +8,7 @@ from compgs.training.splats.hooks import Hooks
 from compgs.training.structure.importance import spread
 
 if TYPE_CHECKING:
-    from compgs.training.splats.trainer import SplatTrainer
+    from compgs.training.splats.hooks import SplatRun
 
 
 class Pruned(Hooks):
@@ -18,7 +18,7 @@ class Pruned(Hooks):
         super().__init__()
         self.share = share
 
-    def begin(self, trainer: "SplatTrainer") -> None:
+    def begin(self, trainer: "SplatRun") -> None:
         cameras = [view.camera for view in spread(trainer.scene.train_views, PRUNED_BY)]
         weights = view_significance(trainer.as_drawn(), cameras, trainer.settings)
         kept = all_but_lowest(weights, self.share)

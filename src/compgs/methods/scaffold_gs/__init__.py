@@ -4,68 +4,18 @@ The ancestor of the anchor methods: all that is trained is in `compgs.methods.an
 What is as published, what is not and why: docs/methods/scaffold-gs.md.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig
-from compgs.methods.anchors.settings import ANCHOR_SETTINGS, AnchorSection
+from compgs.methods.anchors.settings import ANCHOR_SETTINGS
 from compgs.methods.method import PACKED_SUFFIX, Method
+from compgs.methods.scaffold_gs.settings import PUBLISHED, SCALED, ScaffoldConfig
 
 if TYPE_CHECKING:
-    from compgs.devices import Device
-    from compgs.formats.packed import Packed
     from compgs.methods.anchors.model import AnchorModel
-    from compgs.methods.anchors.scene import AnchorScene
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
     from compgs.training.run.run import Run
-
-
-# What differs from the defaults of `compgs.config`, as in the authors' release; schedules as fractions of its 30 000
-# steps: growth each 100 of them from 1 500 to 15 000. A primitive is judged when it was seen in more than 40 steps, an
-# anchor when it was in view in 80 of 100.
-PUBLISHED: Mapping[str, Mapping[str, Any]] = {
-    "model": {"coupled_primitives": 10, "voxel_spacings": 1.0},
-    "control": {
-        "start": 0.05,
-        "stop": 0.5,
-        "every": 1 / 300,
-        "gradient_threshold": 2e-4,
-        "minimum_views": 41,
-        "opacity_threshold": 0.005,
-        "opacity_views": 1,
-        "opacity_share": 0.8,
-        "growth_probabilities": (0.5, 0.75, 0.875),
-        "finer_needs_coarser": True,
-        "rate_exponent": 0.0,
-    },
-    "training": {
-        "schedule": "exponential",
-        "head_warm_up": 0.0,
-        "covariance_lr": (4e-3, 4e-3),
-        "color_lr": (8e-3, 5e-5),
-    },
-    "anchors": {"feature_lr": (7.5e-3, 7.5e-3)},
-}
-# For runs of hundreds or few thousands of steps: features that learn faster and settle, and this project's schedule.
-# In 600 steps that is 1.2 dB.
-SCALED = {
-    **PUBLISHED,
-    "training": {"schedule": "cosine", "head_warm_up": 0.05},
-    "anchors": {"feature_lr": (0.0165, 1e-4)},
-}
-
-
-@dataclass(frozen=True)
-class ScaffoldConfig(Config):
-    """All settings of a run."""
-
-    model: ModelConfig = field(default_factory=lambda: ModelConfig(**PUBLISHED["model"]))
-    control: ControlConfig = field(default_factory=lambda: ControlConfig(**PUBLISHED["control"]))
-    training: TrainingConfig = field(default_factory=lambda: TrainingConfig(**PUBLISHED["training"]))
-    anchors: AnchorSection = field(default_factory=lambda: AnchorSection(**PUBLISHED["anchors"]))
 
 
 def train(
@@ -79,16 +29,9 @@ def train(
 
 
 def write(model: "AnchorModel", path: Path, config: ScaffoldConfig) -> int:
-    from compgs.methods.scaffold_gs.file import write_anchors
+    from compgs.published.scaffold_gs import write_anchors
 
     return write_anchors(model.as_hybrid_model(), path)
-
-
-def open_file(packed: "Packed", device: "Device", background: tuple[float, float, float]) -> "AnchorScene":
-    """Drawn by the CPU, on whatever device."""
-    from compgs.methods.scaffold_gs.file import opened
-
-    return opened(packed, background)
 
 
 SCAFFOLD_GS = Method(
@@ -99,7 +42,6 @@ SCAFFOLD_GS = Method(
     uses=ANCHOR_SETTINGS,
     train=train,
     write=write,
-    open=open_file,
     settings=ScaffoldConfig,
     presets={
         "paper": PUBLISHED,

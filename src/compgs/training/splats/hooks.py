@@ -9,19 +9,18 @@ A hook's own parameters (codebooks, masks, decoders) are those of a `torch.nn.Mo
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
+import torch
 from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.losses import Target
-from compgs.render import RasterResult
+from compgs.render import RasterResult, RasterSettings
+from compgs.scene.views import Scene
 from compgs.tensors.splats import Splats
-
-if TYPE_CHECKING:
-    from compgs.training.splats.trainer import SplatTrainer
-
+from compgs.training.splats.parameters import SplatParameters
 
 HOOKS = "hooks/"  # before the names of the hooks' parameters, in checkpoints and in the optimizer
 
@@ -35,6 +34,42 @@ class Drawn:
     splats: Splats  # as they were drawn: after the hooks' `transform`
     gaussians: Gaussians
     rendered: RasterResult
+
+
+class SplatRun(Protocol):
+    """What hooks see of a run (`training/splats/trainer.py`), and what they may ask of it."""
+
+    scene: Scene
+    config: Any
+    device: torch.device
+    step: int
+    settings: RasterSettings
+    parameters: SplatParameters
+    optimizer: torch.optim.Optimizer
+    schedule: Any
+    world_offset: tuple[float, float, float]
+    hooks: "Hooks"
+
+    @property
+    def progress(self) -> float:
+        """Return the fraction of the phase that is done, 0 to 1."""
+        ...
+
+    def inside(self, splats: Splats, camera: Camera) -> Tensor:
+        """[M] bool: splats that may be in the image."""
+        ...
+
+    def as_drawn(self) -> Splats:
+        """The splats as the hooks' `transform` leaves them, without gradients."""
+        ...
+
+    def keep(self, kept: Tensor) -> None:
+        """Remove the splats outside of `kept` [M] bool; all that belongs to them goes, too."""
+        ...
+
+    def train_hooks(self) -> None:
+        """Let Adam move the hooks' parameters that are new."""
+        ...
 
 
 class Hooks(nn.Module):
@@ -51,10 +86,10 @@ class Hooks(nn.Module):
     # By which all learning rates are multiplied at the end of the phase (exponential from 1), beside their own decay.
     slowing: float = 1.0
 
-    def begin(self, trainer: "SplatTrainer") -> None:
+    def begin(self, trainer: SplatRun) -> None:
         """Make what depends on the splats there are, before the first step; not when a run is resumed."""
 
-    def view(self, camera: Camera, photograph: Target, trainer: "SplatTrainer") -> tuple[Camera, Target]:
+    def view(self, camera: Camera, photograph: Target, trainer: SplatRun) -> tuple[Camera, Target]:
         """What this step looks at: the view as it is, a smaller one, another picture of it."""
         return camera, photograph
 
@@ -62,26 +97,26 @@ class Hooks(nn.Module):
         """Make a camera as large as `view` does at a `progress` of the run, 0 to 1."""
         return camera
 
-    def transform(self, splats: Splats, trainer: "SplatTrainer") -> Splats:
+    def transform(self, splats: Splats, trainer: SplatRun) -> Splats:
         """The splats as they are drawn, differentiable: quantized, masked, decoded. Density control judges these."""
         return splats
 
-    def loss(self, drawn: Drawn, trainer: "SplatTrainer") -> Tensor | None:
+    def loss(self, drawn: Drawn, trainer: SplatRun) -> Tensor | None:
         """[] to add to the loss of a view: a penalty, a rate, a distillation."""
         return None
 
-    def densified(self, trainer: "SplatTrainer") -> None:
+    def densified(self, trainer: SplatRun) -> None:
         """Right after splats were cloned, split and removed."""
 
-    def after_step(self, trainer: "SplatTrainer") -> None:
+    def after_step(self, trainer: SplatRun) -> None:
         """Act after each step; `trainer.step` is the number of steps done."""
 
-    def finish(self, trainer: "SplatTrainer") -> None:
+    def finish(self, trainer: SplatRun) -> None:
         """Act after the last step. It is called again if the finished run is resumed: the second time must change
         nothing.
         """
 
-    def estimated_bytes(self, trainer: "SplatTrainer") -> int | None:
+    def estimated_bytes(self, trainer: SplatRun) -> int | None:
         """Estimate the bytes of the file if it were written now; None: those of a .ply file."""
         return None
 

@@ -14,18 +14,22 @@ The scales of a splat are the positive ones of its entry, normalized to length 1
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from compgs.formats.arrays import SplatArrays, harmonics_above_dc, logit
-from compgs.formats.packed import Packed
+from compgs.formats.packed import Packed, splat_model
 from compgs.formats.sog import morton_order
-from compgs.methods.c3dgs import NAME
-from compgs.methods.parts.content import Offset, stored_place
-from compgs.methods.parts.indices import checked_labels
-from compgs.methods.parts.levels import Levels, stored_levels
+from compgs.model.splats import SplatModel
+from compgs.published.parts.content import Offset, stored_place
+from compgs.published.parts.indices import checked_labels
+from compgs.published.parts.levels import Levels, stored_levels
 
+if TYPE_CHECKING:
+    from compgs.devices import Device
+
+NAME = "c3dgs"  # of the method, as its files have it
 THINNEST = 1e-4  # of a splat's size: an axis that 8 bits show as 0 is this long
 SPLAT_BYTES = 6 + 1 + 1 + 4 + 4  # the law, before DEFLATE
 
@@ -70,6 +74,11 @@ def packed_splats(shared: Shared, degree: int, center: Offset, offset: Offset) -
             arrays[name] = levels.codes[order] if values.ndim == 1 else levels.codes
             facts |= levels.facts(name)
     return Packed(NAME, facts, arrays)
+
+
+def opened(packed: Packed, device: "Device", background: tuple[float, float, float]) -> SplatModel:
+    """The scene of such a file. Raises SplatFileError."""
+    return splat_model(packed, splats_of(packed), device, background)
 
 
 def splats_of(packed: Packed) -> SplatArrays:

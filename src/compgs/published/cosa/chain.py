@@ -10,7 +10,7 @@ import numpy as np
 
 from compgs.codec.content import fixed_point
 from compgs.codec.integer_network import FRACTION_BITS, IntegerNetwork, entropy_parameters, evaluate
-from compgs.methods.cosa.shape import ChainShape
+from compgs.published.cosa.shape import ChainShape
 
 # (group, means Q12, tables of the Gaussians) -> symbols, all [N, channels]; of offsets [P, 3], of those that exist.
 Code = Callable[[str, np.ndarray, np.ndarray], np.ndarray]

@@ -13,23 +13,27 @@ above degree 0 there are no `rest_*`. Nothing is compressed: that is how its siz
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from compgs.formats.arrays import SplatArrays, harmonics_above_dc
-from compgs.formats.packed import Packed
-from compgs.methods.compact3d import NAME
-from compgs.methods.parts.content import stored_place
-from compgs.methods.parts.indices import (
+from compgs.formats.packed import Packed, splat_model
+from compgs.model.splats import SplatModel
+from compgs.published.parts.content import stored_place
+from compgs.published.parts.indices import (
     index_bits,
     label_counts,
     packed_indices,
     stored_counts,
     stored_indices,
 )
-from compgs.methods.parts.levels import Levels, stored_levels
+from compgs.published.parts.levels import Levels, stored_levels
 
+if TYPE_CHECKING:
+    from compgs.devices import Device
+
+NAME = "compact3d"  # of the method, as its files have it
 SORTED = "quaternions"  # what splats are sorted by
 LABELED = ("dc", "log_scales", "rest")
 POSITION_BITS, OPACITY_BITS = 16, 8  # of BitQ
@@ -66,6 +70,11 @@ def packed_splats(
             arrays[f"{name}_labels"] = packed_indices(labels[name][order], len(codes[name]))
         arrays[f"{name}_codes"] = codes[name]
     return Packed(NAME, facts, arrays)
+
+
+def opened(packed: Packed, device: "Device", background: tuple[float, float, float]) -> SplatModel:
+    """The scene of such a file. Raises SplatFileError."""
+    return splat_model(packed, splats_of(packed), device, background)
 
 
 def splats_of(packed: Packed) -> SplatArrays:

@@ -21,12 +21,12 @@ from compgs.errors import SplatFileError
 from compgs.formats.arrays import drawable
 from compgs.formats.packed import Packed
 from compgs.gaussians import Gaussians
-from compgs.methods.compact_3dgs import MOST_CELLS, MOST_FEATURES, MOST_LEVELS, MOST_TABLE_BITS
-from compgs.methods.compact_3dgs.color_network import ColorNetwork, network_shapes
-from compgs.methods.compact_3dgs.hash_grid import GridLayout
-from compgs.methods.parts.content import Content, Offset, stored_place
-from compgs.methods.parts.indices import packed_indices, stored_indices
 from compgs.model.splats import SplatArrays, SplatModel
+from compgs.published.compact_3dgs import MOST_CELLS, MOST_FEATURES, MOST_LEVELS, MOST_TABLE_BITS
+from compgs.published.compact_3dgs.color_network import ColorNetwork, network_shapes
+from compgs.published.compact_3dgs.hash_grid import GridLayout
+from compgs.published.parts.content import Content, Offset, stored_place
+from compgs.published.parts.indices import packed_indices, stored_indices
 
 if TYPE_CHECKING:
     from compgs.devices import Device

@@ -12,18 +12,22 @@
 | 6 | log scales, world units: of the offsets, of the Gaussians |
 | 4 | rotation: a quaternion that nothing uses |
 
-The networks' weights and biases follow by name (`methods/anchors/scene.py`), float32.
+The networks' weights and biases follow by name (`published/anchors.py`), float32.
 """
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from compgs.errors import SplatFileError
 from compgs.formats.packed import Packed, write_packed
-from compgs.methods.anchors.scene import AnchorScene, Frame, network_shapes
-from compgs.methods.parts.content import stored_place
+from compgs.published.anchors import AnchorScene, Frame, network_shapes
+from compgs.published.parts.content import stored_place
+
+if TYPE_CHECKING:
+    from compgs.devices import Device
 
 MOST_OFFSETS, MOST_FEATURES, MOST_WIDTH = 64, 256, 256
 MOST_LOG_SCALE = 88.0  # its exponential is the largest that float32 holds
@@ -61,8 +65,8 @@ def write_anchors(scene: AnchorScene, path: Path) -> int:
     return write_packed(path, Packed("scaffold-gs", facts, {"anchors": rows, **scene.weights}), ("raw",))
 
 
-def opened(packed: Packed, background: tuple[float, float, float]) -> AnchorScene:
-    """Inverse of `write_anchors`. Raises SplatFileError."""
+def opened(packed: Packed, device: "Device", background: tuple[float, float, float]) -> AnchorScene:
+    """Inverse of `write_anchors`; drawn by the CPU, on whatever device. Raises SplatFileError."""
     k = packed.whole_number("offsets", 1, MOST_OFFSETS)
     width = packed.whole_number("width", 1, MOST_WIDTH)
     rows = _finite(packed, "anchors", (None, None))

@@ -14,14 +14,20 @@
 C = 3 (degree + 1)^2: coefficients of degree 0 first, RGB each. Facts: `degree`, `offset` of the positions, world units.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from compgs.formats.arrays import SplatArrays, harmonics_above_dc, normalized
-from compgs.formats.packed import Packed, packed_bits, unpacked_bits
-from compgs.methods.lightgaussian import NAME
-from compgs.methods.parts.content import stored_place
-from compgs.methods.parts.indices import index_bits, packed_indices, stored_indices
+from compgs.formats.packed import Packed, packed_bits, splat_model, unpacked_bits
+from compgs.model.splats import SplatModel
+from compgs.published.parts.content import stored_place
+from compgs.published.parts.indices import index_bits, packed_indices, stored_indices
 
+if TYPE_CHECKING:
+    from compgs.devices import Device
+
+NAME = "lightgaussian"  # of the method, as its files have it
 GEOMETRY_BYTES = 12 + 6 + 8 + 2
 MOST_HALF = float(np.finfo(np.float16).max)
 
@@ -45,6 +51,11 @@ def packed_splats(
         "codes": half(codes),
     }
     return Packed(NAME, {"degree": splats.degree, "offset": list(splats.world_offset)}, arrays)
+
+
+def opened(packed: Packed, device: "Device", background: tuple[float, float, float]) -> SplatModel:
+    """The scene of such a file. Raises SplatFileError."""
+    return splat_model(packed, splats_of(packed), device, background)
 
 
 def splats_of(packed: Packed) -> SplatArrays:

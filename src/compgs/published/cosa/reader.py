@@ -1,7 +1,7 @@
 """A file becomes a scene again: the mirror image of writer.py. Every promise is bounded before anything is computed."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,15 +15,23 @@ from compgs.codec.tables import gaussian_tables
 from compgs.codec.weights import decode_heads, decode_networks
 from compgs.errors import BitstreamError, CorruptSection, SplatFileError
 from compgs.formats.packed import Packed
-from compgs.methods.anchors.scene import Frame, network_shapes
-from compgs.methods.cosa.chain import coordinate_inputs, walk
-from compgs.methods.cosa.content import CosaContent
-from compgs.methods.cosa.shape import GROUPS, ChainShape
+from compgs.published.anchors import AnchorScene, Frame, network_shapes
+from compgs.published.cosa.chain import coordinate_inputs, walk
+from compgs.published.cosa.content import CosaContent, scene_of
+from compgs.published.cosa.shape import GROUPS, ChainShape
+
+if TYPE_CHECKING:
+    from compgs.devices import Device
 
 MOST = (64, 256, 16, 256)  # coupled primitives, features, latents, channels of a context
 DEEPEST = 21  # of the cube
 FARTHEST = 1 << 31  # voxels, of its corner
 SMALLEST, LARGEST = 2.0**-64, 2.0**64
+
+
+def opened(packed: Packed, device: "Device", background: tuple[float, float, float]) -> AnchorScene:
+    """The scene of such a file; drawn by the CPU, on whatever device. Raises SplatFileError."""
+    return scene_of(content_of(packed))
 
 
 def content_of(packed: Packed) -> CosaContent:

@@ -4,7 +4,7 @@
     rotation  = latents [M, L] @ weights [L, 4]
 
 In the file: positions, colors and scales as float32, the decoders as float32, and all integers of an attribute by one
-histogram (`methods/parts/histogram.py`).
+histogram (`published/parts/histogram.py`).
 """
 
 from collections.abc import Mapping
@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compgs.formats.packed import Packed, splat_model
-from compgs.methods.parts.content import Content, Offset, stored_place
-from compgs.methods.parts.histogram import packed_symbols, unpacked_symbols
 from compgs.model.degrees import MAX_DEGREE, harmonics_above_dc
 from compgs.model.splats import SplatArrays, SplatModel
+from compgs.published.parts.content import Content, Offset, stored_place
+from compgs.published.parts.histogram import packed_symbols, unpacked_symbols
 
 if TYPE_CHECKING:
     from compgs.devices import Device

@@ -7,8 +7,8 @@ import numpy as np
 
 from compgs.codec.integer_network import FRACTION_BITS, IntegerNetwork
 from compgs.codec.weights import QuantizedTensor
-from compgs.methods.anchors.scene import AnchorScene, Frame
-from compgs.methods.cosa.shape import ChainShape
+from compgs.published.anchors import AnchorScene, Frame
+from compgs.published.cosa.shape import ChainShape
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compgs.methods.compact_3dgs.hash_grid import GridLayout, grid_features
 from compgs.model.spherical_harmonics import COLOR_OFFSET, harmonic_basis
 from compgs.model.spherical_harmonics_kernels import Y0
+from compgs.published.compact_3dgs.hash_grid import GridLayout, grid_features
 
 DIRECTION_DEGREE = 3
 DIRECTION_NUMBERS = 16

@@ -1,4 +1,7 @@
-"""Which formats there are: a file is known by its first bytes, never by its name; what is written, by its name."""
+"""Opening any file of a scene: its format is known by the first bytes, never by the name.
+
+`compgs.formats` has the formats of splats and our own, `compgs.published` the files of the other methods.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from compgs.devices import placed
-from compgs.errors import ConfigError, NotACompGSFile, OutputError, SplatFileError
+from compgs.errors import ConfigError, NotACompGSFile, SplatFileError
 from compgs.formats import (
     cgs,
     glb,
@@ -25,6 +28,7 @@ from compgs.formats import (
 from compgs.formats.arrays import SplatArrays
 from compgs.model.splats import SplatModel
 from compgs.paths import as_path
+from compgs.published import READERS
 
 if TYPE_CHECKING:
     from compgs.devices import Device
@@ -69,18 +73,17 @@ def _open_cgs(path: Path, device: "Device", background: Background) -> "Renderab
 
 
 def _open_packed(path: Path, device: "Device", background: Background) -> "Renderable":
-    from compgs.methods import METHODS  # the only way up: a method's file says which method reads it
-
     content = packed.read(path)
-    method = METHODS.get(content.method)
-    if method is None or method.open is None:
-        known = ", ".join(name for name, each in METHODS.items() if each.open) or "none"
+    if content.method not in READERS:
+        known = ", ".join(READERS)
         raise SplatFileError(f"{path}: a file of method {content.method}; known here are those of {known}")
-    return method.open(content, device, background)
+    return READERS[content.method](content, device, background)
 
 
 def _open_tiles(path: Path, device: "Device", background: Background) -> "Renderable":
-    return tiled.open_tiles(path, device)
+    from compgs.formats.tiled_scene import open_tiles  # with what draws them
+
+    return open_tiles(path, device)
 
 
 STREAMED = _of_splats("sog", sog_streamed)
@@ -102,18 +105,6 @@ FORMATS = (
     Format("packed", packed.begins, packed.check, packed.component_bytes, _open_packed),
     _of_splats("splat", splat),
 )
-
-# Content of a file of splats, by what the name ends in. `spz` is version 3, which needs nothing to be installed.
-WRITERS: dict[str, Callable[[SplatArrays], bytes]] = {
-    "ply": ply.encoded,
-    "spz": spz.encoded,
-    "sog": sog.encoded,
-    "glb": glb.encoded,
-}
-# What becomes of splats that a format cannot hold as they are, in words.
-TOLD: dict[str, Callable[[SplatArrays], str | None]] = {"spz": spz.told, "glb": glb.told}
-# Formats that say where positions count from, or whose positions are of the world.
-KEEP_WORLD_OFFSET = ("ply", "glb")
 
 
 def scene_file(path: Path) -> Path:
@@ -194,23 +185,3 @@ def _check_has_levels(path: Path) -> None:
     """Raises ConfigError."""
     if format_of(path) is not STREAMED:
         raise ConfigError(f"{path}: --level is for scenes of several levels ({sog_streamed.NAME})")
-
-
-def writer_of(path: Path) -> str:
-    """The format that a name asks for, a key of `WRITERS`. Raises OutputError."""
-    name = path.suffix.lower().removeprefix(".")
-    if name not in WRITERS:
-        raise OutputError(f"{path}: expected a name that ends in {', '.join(f'.{each}' for each in WRITERS)}")
-    return name
-
-
-def encoded(arrays: SplatArrays, name: str) -> bytes:
-    """Content of a file of one of `WRITERS`. Raises SplatFileError for what the format cannot hold."""
-    if not len(arrays):
-        raise SplatFileError(f".{name}: there are no splats to write")
-    return WRITERS[name](arrays)
-
-
-def told(arrays: SplatArrays, name: str) -> str | None:
-    """What one of `WRITERS` makes of splats that it cannot hold as they are, in words; None: nothing worth telling."""
-    return TOLD[name](arrays) if name in TOLD else None
