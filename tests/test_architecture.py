@@ -81,7 +81,8 @@ ALLOWED = {
     "reconstruct": BASE | {"scene"},
     "evaluation": BASE | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "opening"},
     "viewer": BASE | {"render", "model", "devices", "metrics", "codec", "formats", "opening", "evaluation"},
-    "exporting": BASE | {"render", "model", "devices", "metrics", "formats", "opening", "evaluation", "viewer"},
+    "exporting": BASE
+    | {"render", "model", "devices", "metrics", "formats", "opening", "evaluation", "viewer"},
     "compressing": BASE
     | {
         "scene",
@@ -100,7 +101,18 @@ ALLOWED = {
     "tiles": BASE | {"scene", "formats", "suites"},
     "cli": BASE
     | {"scene", "render", "model", "devices", "metrics", "codec", "formats", "opening"}
-    | {"training", "evaluation", "trained_model", "exporting", "compressing", "viewer", "methods", "reconstruct", "suites", "tiles"},
+    | {
+        "training",
+        "evaluation",
+        "trained_model",
+        "exporting",
+        "compressing",
+        "viewer",
+        "methods",
+        "reconstruct",
+        "suites",
+        "tiles",
+    },
     "__main__": BASE | {"cli"},
 }
 

@@ -110,7 +110,7 @@ def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
     [
         ["train", "nowhere", "-o", "FOLDER", "--overwrite"],
         ["train", "-o", "FOLDER", "--resume"],
-        ["train", "nowhere", "-o", "FOLDER", "--tiles", "2x1"],
+        ["tiles", "nowhere", "-o", "FOLDER", "--grid", "2x1"],
         ["reconstruct", "PHOTOS", "-o", "FOLDER"],
         ["demo-scene", "FOLDER"],
         ["compress", "GOLDEN", "-o", "FOLDER.cgs"],

@@ -7,8 +7,9 @@ import pytest
 
 from compgs.cli.main import main, parse
 from compgs.cli.run_folder import file_name, load_settings, save_settings
-from compgs.cli.train import CHECKPOINT_NAME, Train
+from compgs.cli.train import Train
 from compgs.errors import CheckpointError, ConfigError
+from compgs.training.run.checkpoint import CHECKPOINT_NAME
 
 
 def settings(*arguments: object) -> Any:

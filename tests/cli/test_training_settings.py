@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from compgs.cli.ending import say_miss
 from compgs.cli.main import parse
 from compgs.cli.run_folder import (
     RunSettings,
@@ -17,11 +18,13 @@ from compgs.cli.run_folder import (
     save_settings,
 )
 from compgs.cli.settings import parse_value, with_settings
-from compgs.cli.train import CHECKPOINT_NAME, Train, interrupted, say_miss
+from compgs.cli.train import Train
+from compgs.cli.training_command import interrupted
 from compgs.cli.usage import UsageError
 from compgs.config import Config, load_config
 from compgs.errors import CheckpointError, ConfigError, TrainingError
 from compgs.outputs import write_bytes
+from compgs.training.run.checkpoint import CHECKPOINT_NAME
 
 
 def train(*arguments: object) -> Train:

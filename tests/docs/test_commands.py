@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from compgs.cli.main import main
-from compgs.cli.train import Train
+from compgs.cli.training_command import TrainingCommand
 from compgs.scene.generated import generate_scene
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,7 +52,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ["train", "scenes/garden", "-o", "runs/garden"],
             ["train", "scenes/garden", "-o", "runs/plain", "--method", "3dgs"],
             ["train", "scenes/garden", "-o", "runs/paper", "--preset", "paper"],
-            ["train", "scenes/city", "-o", "runs/city", "--tiles", "2x1"],
+            ["tiles", "scenes/city", "-o", "runs/city", "--grid", "2x1"],
         ):
             assert main(arguments) == 0
     finally:
@@ -72,15 +72,15 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shorten(patch: pytest.MonkeyPatch) -> None:
-    whole = Train.settings
+    whole = TrainingCommand.settings
 
-    def settings(self: Train, folder: Path) -> Any:
+    def settings(self: TrainingCommand, folder: Path) -> Any:
         asked = whole(self, folder)
         training = asked.config.training
         config = replace(asked.config, training=replace(training, steps=min(STEPS, training.steps)))
         return asked if self.resume else replace(asked, config=config)
 
-    patch.setattr(Train, "settings", settings)
+    patch.setattr(TrainingCommand, "settings", settings)
     patch.setattr("compgs.suites.jobs._run", in_this_process)
 
 

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import compgs
-from compgs.cli import train as train_command
+from compgs.cli import training_command as train_command
 from compgs.cli.main import main
 from compgs.cli.settings import with_settings
 from compgs.evaluation import camera_path

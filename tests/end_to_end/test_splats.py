@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from compgs.cli import train as train_command
+from compgs.cli import training_command as train_command
 from compgs.cli.main import main
 from compgs.formats import read_ply
 from compgs.metrics import psnr

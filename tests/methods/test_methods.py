@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import compgs
-from compgs.cli import train as train_command
+from compgs.cli import training_command as train_command
 from compgs.cli.main import main
 from compgs.config import Config, SplatConfig, TrainingConfig
 from compgs.errors import CheckpointError, ConfigError, SplatFileError

@@ -1,4 +1,4 @@
-"""`compgs train --tiles` on a generated scene of a few pixels: from photographs to a folder of tiles."""
+"""`compgs tiles` on a generated scene of a few pixels: from photographs to a folder of tiles."""
 
 import json
 import shutil
@@ -12,9 +12,9 @@ import pytest
 
 import compgs
 from compgs import extras
-from compgs.cli import train as train_command
-from compgs.cli.main import main
-from compgs.cli.tiles import _compute as options_of_tiles
+from compgs.cli import training_command as train_command
+from compgs.cli.main import main, parse
+from compgs.cli.tiles import Tiles
 from compgs.cli.train import Train
 from compgs.formats.tiled import read_manifest
 from compgs.formats.tiled_scene import ASKED_BY, TiledScene
@@ -72,7 +72,7 @@ def city(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "city"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jobs_module, "_run", InThisProcess())
-        assert main(["train", str(scene), "-o", str(folder), "--tiles", "2x1", *OPTIONS]) == 0
+        assert main(["tiles", str(scene), "-o", str(folder), "--grid", "2x1", *OPTIONS]) == 0
     return folder
 
 
@@ -138,7 +138,7 @@ def test_a_finished_run_trains_nothing_again(city: Path, tmp_path: Path, runs: I
 def test_other_settings_train_anew(scene: Path, city: Path, tmp_path: Path, runs: InThisProcess) -> None:
     copy = tmp_path / "city"
     shutil.copytree(city, copy)
-    again = ["train", str(scene), "-o", str(copy), "--tiles", "2x1", "--overwrite", *OPTIONS]
+    again = ["tiles", str(scene), "-o", str(copy), "--grid", "2x1", "--overwrite", *OPTIONS]
     assert main([*again, "--steps", "5"]) == 0
     assert runs.tiles == ["0_0", "1_0"]
     assert json.loads((copy / "training.json").read_text())["steps"] == 10
@@ -174,22 +174,22 @@ def test_a_run_that_is_stopped_in_a_tile_goes_on_there_and_comes_to_the_same_fil
             return stopping_at(10) if len(begun) == 2 else whole()
 
         patch.setattr(train_command, "training", second_stops)
-        assert main(["train", str(scene), "-o", str(folder), "--tiles", "2x1", *OPTIONS]) == 130
-    assert f"compgs train -o {folder} --resume" in capsys.readouterr().err
+        assert main(["tiles", str(scene), "-o", str(folder), "--grid", "2x1", *OPTIONS]) == 130
+    assert f"compgs tiles -o {folder} --resume" in capsys.readouterr().err
     assert (folder / "blocks" / "0_0" / "0_0.cgs").is_file()
     assert (folder / "blocks" / "1_0" / "checkpoint.safetensors").is_file()
     assert not (folder / "blocks" / "1_0" / "1_0.cgs").exists() and not (folder / "city.tiles").exists()
     code = main(["evaluate", str(folder)])
     assert code == 1 and "has not written manifest.json yet" in capsys.readouterr().err
     runs.calls.clear()
-    assert main(["train", "-o", str(folder), "--resume", "--threads", "1"]) == 0
+    assert main(["tiles", "-o", str(folder), "--resume", "--threads", "1"]) == 0
     assert runs.calls == [["train", "-o", str(folder / "blocks" / "1_0"), "--resume", "--threads", "1"]]
     for file in (city / "city.tiles").iterdir():
         assert (folder / "city.tiles" / file.name).read_bytes() == file.read_bytes()
 
 
 def test_one_tile_alone_is_the_tile_of_all(city: Path, tmp_path: Path) -> None:
-    alone = ["train", "--tile", f"{city / 'plan.json'}#1_0", "-o", str(tmp_path / "1_0"), "--threads", "1"]
+    alone = ["tiles", "--tile", f"{city / 'plan.json'}#1_0", "-o", str(tmp_path / "1_0"), "--threads", "1"]
     assert main(alone) == 0
     assert (tmp_path / "1_0" / "1_0.cgs").read_bytes() == (city / "city.tiles" / "1_0.cgs").read_bytes()
 
@@ -220,7 +220,7 @@ def test_a_tile_that_fails_is_said_and_the_others_are_trained(
 
     monkeypatch.setattr(jobs_module, "_run", run)
     folder = tmp_path / "city"
-    assert main(["train", str(scene), "-o", str(folder), "--tiles", "2x1", *OPTIONS]) == 1
+    assert main(["tiles", str(scene), "-o", str(folder), "--grid", "2x1", *OPTIONS]) == 1
     said = capsys.readouterr().err
     assert "1 of 2 tiles failed; tile 0_0: exit code 1: error: no space" in said
     assert (folder / "blocks" / "1_0" / "1_0.cgs").is_file() and not (folder / "city.tiles").exists()
@@ -299,8 +299,8 @@ def test_two_tiles_at_once_on_a_cluster_are_those_of_one_after_the_other(
     stops = signal.getsignal(signal.SIGTERM)
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
     try:
-        options = ["--tiles", "2x1", "--cluster", "local", *OPTIONS]
-        assert main(["train", str(scene), "-o", str(tmp_path / "city"), *options]) == 0
+        options = ["--grid", "2x1", "--cluster", "local", *OPTIONS]
+        assert main(["tiles", str(scene), "-o", str(tmp_path / "city"), *options]) == 0
     finally:
         ray.shutdown()
         signal.signal(signal.SIGTERM, stops)
@@ -317,8 +317,8 @@ def test_without_ray_the_remedy_is_said_before_anything_runs(
     runs: InThisProcess,
 ) -> None:
     monkeypatch.setitem(extras.PACKAGES, "cluster", ("a_package_that_nobody_has",))
-    options = ["--tiles", "2x1", "--cluster", "local", *OPTIONS]
-    assert main(["train", str(scene), "-o", str(tmp_path / "out"), *options]) == 1
+    options = ["--grid", "2x1", "--cluster", "local", *OPTIONS]
+    assert main(["tiles", str(scene), "-o", str(tmp_path / "out"), *options]) == 1
     assert "pip install '.[cluster]'" in capsys.readouterr().err.replace("\n", " ")
     assert not (tmp_path / "out").exists() and not runs.calls
 
@@ -326,16 +326,10 @@ def test_without_ray_the_remedy_is_said_before_anything_runs(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--tiles", "2"], "--tiles 2: expected auto, or columns and rows"),
-        (["--tiles", "9x9"], "expected at least 100; use fewer tiles"),
-        (["--tiles", "2x1", "--method", "3dgs"], "which --method 3dgs does not write"),
-        (["--tiles", "2x1", "--target-size", "1MB"], "--target-size with --tiles"),
-        (["--tiles", "2x1", "--viewer"], "--viewer with --tiles"),
-        (["--tiles", "2x1", "--profile"], "--profile with --tiles"),
-        (["--tiles", "2x1", "--cpus", "0"], "--cpus 0 --gpus 0: expected cores above 0"),
-        (["--cluster", "local"], "--cluster: one training runs on one machine"),
-        (["--tiles", "2x1", "--tile", "plan.json#0_0"], "give one"),
-        (["--tile", "plan.json#0_0", "-r", "2"], "scene and settings are those of the run"),
+        (["--grid", "2"], "--grid 2: expected auto, or columns and rows"),
+        (["--grid", "9x9"], "expected at least 100; use fewer tiles"),
+        (["--grid", "2x1", "--cpus", "0"], "--cpus 0 --gpus 0: expected cores above 0"),
+        (["--tile", "plan.json#0_0"], "takes the scene and settings from PLAN"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused_before_anything_is_made(
@@ -346,7 +340,7 @@ def test_options_that_do_not_go_together_are_refused_before_anything_is_made(
     capsys: pytest.CaptureFixture[str],
     runs: InThisProcess,
 ) -> None:
-    assert main(["train", str(scene), "-o", str(tmp_path / "out"), *options, "--steps", "1"]) == 2
+    assert main(["tiles", str(scene), "-o", str(tmp_path / "out"), *options, "--steps", "1"]) == 2
     assert message in capsys.readouterr().err.replace("\n", " ")
     assert not (tmp_path / "out").exists() and not runs.calls
 
@@ -355,16 +349,31 @@ def test_processes_of_a_torchrun_do_not_train_tiles(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("compgs.cli.tiles.several", lambda: True)
-    assert main(["train", str(scene), "-o", str(tmp_path / "out"), "--tiles", "2x1"]) == 2
+    assert main(["tiles", str(scene), "-o", str(tmp_path / "out"), "--grid", "2x1"]) == 2
     assert "torchrun's processes share one training" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_tiles_on_a_cluster_share_the_cores_of_their_machines() -> None:
-    here = Train(output=Path("x"), tiles="2x1", threads=3)
-    assert options_of_tiles(here) == ["--threads", "3"]
-    assert options_of_tiles(Train(output=Path("x"), tiles="2x1")) == []
-    away = Train(output=Path("x"), tiles="2x1", cluster="local", cpus=2.5, device="cpu")
-    assert options_of_tiles(away) == ["--threads", "2", "--device", "cpu"]
+    assert Tiles(grid="2x1", threads=3).options_of_tiles() == ["--threads", "3"]
+    assert Tiles(grid="2x1").options_of_tiles() == []
+    away = Tiles(grid="2x1", cluster="local", cpus=2.5, device="cpu")
+    assert away.options_of_tiles() == ["--threads", "2", "--device", "cpu"]
+
+
+@pytest.mark.parametrize("options", [["-r", "2"], ["--grid", "2x1"], ["--steps", "5"], ["--preset", "quick"]])
+def test_one_tile_has_the_settings_of_its_plan(
+    options: list[str], city: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = f"{city / 'plan.json'}#0_0"
+    assert main(["tiles", "--tile", place, "-o", str(tmp_path / "out"), *options]) == 2
+    assert "takes the scene and settings from PLAN" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_train_with_tiles_is_the_command_of_tiles() -> None:
+    asked = parse(["train", "SCENE", "-o", "RUN", "--tiles", "2x1", "--steps", "9"])
+    assert asked == Tiles(scene=Path("SCENE"), output=Path("RUN"), grid="2x1", steps=9)
+    assert parse(["train", "--tile=p.json#0_0", "-o", "X"]) == Tiles(tile="p.json#0_0", output=Path("X"))
+    assert isinstance(parse(["train", "SCENE", "-o", "RUN"]), Train)
 
 
 @pytest.mark.parametrize(
@@ -379,12 +388,22 @@ def test_tiles_on_a_cluster_share_the_cores_of_their_machines() -> None:
 def test_a_tile_that_is_none_is_refused(
     place: str, code: int, message: str, city: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["train", "--tile", place.format(city=city), "-o", str(tmp_path / "out")]) == code
+    assert main(["tiles", "--tile", place.format(city=city), "-o", str(tmp_path / "out")]) == code
     assert message in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_a_run_goes_on_with_the_tiles_that_it_began_with(
     city: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["train", "-o", str(city), "--resume", "--tiles", "3x1"]) == 2
-    assert "--tiles 3x1: the run to continue began with 2x1" in capsys.readouterr().err
+    assert main(["tiles", "-o", str(city), "--resume", "--grid", "3x1"]) == 2
+    assert "--grid 3x1: the run to continue began with 2x1" in capsys.readouterr().err
+
+
+def test_a_run_in_tiles_is_not_continued_as_one_training_nor_the_other_way_round(
+    city: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "-o", str(city), "--resume"]) == 2
+    assert f"compgs tiles -o {city} --resume" in capsys.readouterr().err.replace("\n", " ")
+    block = city / "blocks" / "0_0"
+    assert main(["tiles", "-o", str(block), "--resume"]) == 2
+    assert f"compgs train -o {block} --resume" in capsys.readouterr().err.replace("\n", " ")

@@ -15,7 +15,7 @@ from compgs.words import duration, size
 
 if TYPE_CHECKING:
     from compgs.codec.reader import RangeInfo
-    from compgs.evaluation.comparison import Comparison
+    from compgs.evaluation.compared_files import Comparison
     from compgs.evaluation.error_account import ErrorAccount, Part, ScalePart
     from compgs.evaluation.reduction import Reduction
     from compgs.evaluation.results import Results

@@ -11,11 +11,11 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from compgs.cli.command import DecodingCommand, ReadingOptions, allow_tmc3
 from compgs.cli.console import print_reduction, say
 from compgs.cli.inputs import check_bitstream, read_bitstream
+from compgs.cli.of_a_tile import cut
 from compgs.cli.progress import counting
 from compgs.cli.run_folder import CHECKPOINT_NAME, SETTINGS_NAME, SceneSource, file_name, load_settings
 from compgs.cli.scenes import read_scene
 from compgs.cli.sizes import parse_cameras
-from compgs.cli.tiles import cut
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.errors import CheckpointError
 from compgs.outputs import check_output_file, write_bytes

@@ -24,6 +24,7 @@ from compgs.cli.encode import Encode
 from compgs.cli.evaluate import Evaluate
 from compgs.cli.export import Export
 from compgs.cli.info import Info
+from compgs.cli.moved import in_words_of_today
 from compgs.cli.notes import notes_shown
 from compgs.cli.reconstruct import Reconstruct
 from compgs.cli.render import Render
@@ -31,6 +32,7 @@ from compgs.cli.report import Report
 from compgs.cli.serve import Serve
 from compgs.cli.streams import give_up_stdout, open_closed_streams
 from compgs.cli.swapped import exchanged
+from compgs.cli.tiles import Tiles
 from compgs.cli.train import Train
 from compgs.cli.usage import UsageError, in_words_of_options
 from compgs.cli.view import View
@@ -40,6 +42,7 @@ from compgs.interrupt import Terminated, ended_on_request, held_back
 COMMANDS: tuple[type[Command], ...] = (
     Reconstruct,
     Train,
+    Tiles,
     Compress,
     Encode,
     Decode,
@@ -75,7 +78,7 @@ def print_help() -> None:
 
 def parse(words: Sequence[str]) -> Command:
     """Raises UsageError for words that are not understood, SystemExit(0) after a command's --help."""
-    return parse_command(COMMANDS, words)
+    return parse_command(COMMANDS, in_words_of_today(words))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

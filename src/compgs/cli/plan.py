@@ -1,39 +1,18 @@
 """What a training decides, for people: said before the first step, and by `compgs train --plan`, which stops there."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from compgs.cli.console import say
 from compgs.cli.run_folder import SETTINGS_NAME, RunSettings
-from compgs.cli.usage import UsageError
 from compgs.errors import CheckpointError
-from compgs.extras import require
 from compgs.words import duration, size
 
 if TYPE_CHECKING:
-    from compgs.cli.train import Train
     from compgs.scene import Scene
     from compgs.training import Plan
 
 PLANNED = "compgs"  # the method whose trainings have a plan
-
-
-def show_plan(command: "Train") -> None:
-    """`compgs train --plan`. Raises UsageError, SceneError, ConfigError."""
-    if command.resume or command.tile is not None:
-        raise UsageError(f"--plan: the plan of a run that has begun is in its {SETTINGS_NAME}")
-    require("train", "training")
-    settings = command.settings(command.output or Path())
-    if settings.method != PLANNED:
-        raise UsageError(f"--plan: --method {settings.method} decides nothing; its settings are all there is")
-    command.prepare_training("train")
-    scene, settings = command.read(settings)
-    settings = planned(settings, scene, command.device)
-    plan = plan_in(settings)
-    assert plan is not None and settings.plan is not None
-    say_lines(settings.plan)
-    say_expected(plan, scene, settings, command.device)
 
 
 def planned(settings: RunSettings, scene: "Scene", device: str | None, tiles: int = 1) -> RunSettings:

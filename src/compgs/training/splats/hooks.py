@@ -45,7 +45,7 @@ class SplatRun(Protocol):
     step: int
     settings: RasterSettings
     parameters: SplatParameters
-    optimizer: torch.optim.Optimizer
+    optimizer: torch.optim.Adam
     schedule: Any
     world_offset: tuple[float, float, float]
     hooks: "Hooks"
