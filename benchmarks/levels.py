@@ -39,8 +39,8 @@ from PIL import Image
 from tiles import flight
 
 from compgs.cameras import Camera
-from compgs.formats import open_tiles
 from compgs.formats.tiled import MANIFEST, MOST_NUMBER, read_manifest
+from compgs.formats.tiled_scene import open_tiles
 from compgs.metrics import psnr, to_8bit
 from compgs.render import render
 from compgs.viewer.gallery import GalleryHandler

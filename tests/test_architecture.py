@@ -14,8 +14,8 @@ SOURCE = Path(compgs.__file__).parent
 
 # A part may import itself, and the parts named here.
 BASE = {
-    "compgs", "numerics", "errors", "extras", "gaussians", "cameras", "config", "interrupt", "notes", "occupied",
-    "outputs", "paths", "pictures", "presets", "progress", "words",
+    "compgs", "numerics", "errors", "extras", "gaussians", "cameras", "config", "former_settings", "interrupt",
+    "notes", "occupied", "outputs", "paths", "pictures", "presets", "progress", "words",
 }  # fmt: skip
 ALLOWED = {
     "compgs": {
@@ -48,7 +48,8 @@ ALLOWED = {
     "words": set(),
     "gaussians": set(),
     "cameras": set(),
-    "config": {"errors", "presets"},
+    "config": {"errors", "former_settings", "presets"},
+    "former_settings": {"errors"},
     "presets": set(),
     "numerics": {"compgs", "extras"},  # `compgs.started`
     "scene": BASE,

@@ -7,6 +7,7 @@ import pytest
 
 from compgs.config import PRESETS, Config, Range, config_from_dict, load_config, wrong_value
 from compgs.errors import ConfigError
+from compgs.former_settings import FORMER
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -37,7 +38,6 @@ def test_an_unknown_preset_is_named_with_the_known_ones():
         ("training", "quantized_weights", math.nan),
         ("training", "checkpoint_minutes", math.nan),
         ("training", "rate", "words"),
-        ("training", "left_out", -1.0),
         ("control", "start", math.nan),
         ("control", "growth_probabilities", [0.5, 0.5, 7.0]),
         ("control", "growth_probabilities", [0.5, 0.5]),
@@ -113,3 +113,20 @@ def test_values_of_another_kind_are_refused_with_what_was_expected():
         ((), Annotated[tuple[float, ...], Range(0, 1)]),
     ):
         assert wrong_value(value, hint) == ""
+
+
+def test_settings_of_earlier_versions_are_read_where_nothing_has_changed() -> None:
+    values = Config().to_dict()
+    for name, former in FORMER.items():
+        section, key = name.split(".")
+        assert key not in values[section]
+        for value in former.values:
+            older = {**values, section: {**values[section], key: value}}
+            assert config_from_dict(older) == Config()
+
+
+def test_settings_of_earlier_versions_that_would_matter_are_refused_with_what_to_do() -> None:
+    values = Config().to_dict()
+    values["training"]["rate_every"] = 8
+    with pytest.raises(ConfigError, match=r"rate_every = 8 is no setting any more; .*all but rate_every"):
+        config_from_dict(values, "config.json")

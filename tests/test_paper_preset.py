@@ -66,16 +66,6 @@ PUBLISHED = {
     "training.averaged": 0.0,
     "training.rules": "none",
 }
-READ_BY_RULES = (
-    "model.voxel_rate_exponent",
-    "control.rate_exponent",
-    "control.prune_less",
-    "training.left_out",
-    "training.coarse_until",
-    "training.rate_every",
-    "training.sampled_gradients",
-    "training.passed_over",
-)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +102,6 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         "training.target_bytes": "",
         "training.quantized_weights": "how weights are stored",
         "training.exposure": "off",
-        **dict.fromkeys(READ_BY_RULES, "no rule is applied"),
         "training.appearance_dtype": "float32",
         "training.entropy_lr_steps": "bounds of short runs",
         "training.viewpoints": "what the file keeps beside the scene",

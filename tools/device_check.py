@@ -232,7 +232,6 @@ def variants(given: Given) -> dict[str, Any]:
         "four views a step": {"training": {"views_per_step": 4}},
         "own residuals": {"model": {"residuals": True}},
         "separate heads": {"model": {"heads": "separate"}},
-        "dropout": {"training": {"left_out": 0.4}},
         "bfloat16": {"training": {"appearance_dtype": "bfloat16"}},
         "a size": {"training": {"target_bytes": 30_000}},
     }
@@ -374,7 +373,7 @@ def one_step(device: str) -> dict[str, Any]:
         scene = load_scene(Path(folder) / "scene")
         config = load_config("default")
         training = replace(
-            config.training, sampled_gradients=0.0, passed_over=0.0, coarse_until=0.0, lmbda=0.002
+            config.training, rules="all but sampled_gradients, coarse_photographs", lmbda=0.002
         )
         trainer = Trainer(scene, replace(config, training=training), torch.device("cpu"))
         chance = torch.Generator().manual_seed(5)

@@ -21,6 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from compgs.config import load_config
+from compgs.errors import ConfigError
+from compgs.former_settings import without_former
 from compgs.outputs import write_bytes
 from compgs.training.plan import RULES, Plan, plan
 
@@ -84,7 +86,11 @@ def outdated(record: Record) -> list[str]:
     now = plan(config, ran.start)
     decided = {f.name for f in fields(Plan)} - {"start", "reasons"}
     found = [name for name in sorted(decided) if getattr(ran, name) != getattr(now, name)]
-    before, after = flat(record["settings"]), flat(json.loads(json.dumps(config.to_dict())))
+    try:
+        settings = without_former(record["settings"], record["name"])
+    except ConfigError:
+        return [*found, "a setting that there is no more"]
+    before, after = flat(settings), flat(json.loads(json.dumps(config.to_dict())))
     by_rules = {rule.sets for rule in RULES}
     found += [n for n in before if before[n] != after.get(n) and n.rpartition(".")[2] not in by_rules]
     return found

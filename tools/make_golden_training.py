@@ -9,6 +9,7 @@ between processors and versions of libraries: the file's hash is exact only for 
 import hashlib
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from compgs.config import Config, ControlConfig, EntropyConfig, ModelConfig, Tra
 from compgs.metrics import psnr, to_8bit
 from compgs.render import render
 from compgs.scene.generated import generate_scene
+from compgs.training.start import plan_for
 from compgs.training.trainer import Trainer
 
 GOLDEN = Path(__file__).parent.parent / "tests" / "golden" / "training.json"
@@ -50,8 +52,8 @@ CONFIG = Config(
         seed=11,
         target_bytes=2_200,
         rate_start=0.05,
-        rate_every=2,
-        sampled_gradients=0.0,  # which ones are in a sample depends on the last bit of all before them
+        # Which gradients are in a sample depends on the last bit of all before them.
+        rules="all but sampled_gradients",
         hard_rate=0.75,
     ),
 )
@@ -70,7 +72,9 @@ def golden_training(folder: Path) -> dict[str, Any]:
     """What training decides, and the file; `folder` is for the scene and the file. No number depends on threads."""
     generate_scene(folder / "scene", views=16, width=64, height=48)
     scene = compgs.load_scene(folder / "scene")
-    trainer = Trainer(scene, CONFIG, torch.device("cpu"))
+    device = torch.device("cpu")
+    planned = replace(plan_for(scene, CONFIG, device), rate_every=2)  # 60 steps are few
+    trainer = Trainer(scene, CONFIG, device, planned=planned)
     # [step, anchors, channels of a reference], whenever one of the two has changed
     events = [[0, trainer.model.anchors, trainer.model.reference_dim]]
     while trainer.step < CONFIG.training.steps:

@@ -15,6 +15,7 @@ from importlib import resources
 from typing import Annotated, Any, Literal
 
 from compgs.errors import ConfigError
+from compgs.former_settings import without_former
 
 PRESETS = ("default", "paper", "quick")
 SHOWN_SETTINGS = 3  # that a repr shows
@@ -84,8 +85,6 @@ class ModelConfig:
     voxel_size: Annotated[float | None, Range(0, above=True)] = None
     # size of a voxel, in median distances between neighbouring points, if `voxel_size` is none
     voxel_spacings: Annotated[float, Range(0, 1e6, above=True, below=True)] = 1.5
-    # voxels grow with this power of lambda / 0.002, if lambda is above 0.002 (not in the paper; rule `coarser_grid`)
-    voxel_rate_exponent: Annotated[float, Range(0, 1)] = 1 / 6
     # anchors start with the colors of the points, in three channels of their references
     point_colors: bool = True
     # growth stops at this number of anchors
@@ -137,8 +136,6 @@ class ControlConfig:
     observe_passes: Annotated[float, Range(0, 1e6, below=True)] = 0.0
     # mean norm of the 2D gradient, in units of half the image
     gradient_threshold: Annotated[float, Range(0, 1e6, above=True, below=True)] = 1e-4
-    # the threshold grows with this power of lambda / 0.002, because anchors cost bits
-    rate_exponent: Annotated[float, Range(0, 2)] = 1 / 3
     # a primitive that was seen less often is not judged (Ref.: more than 40), unless `minimum_share` allows it
     minimum_views: Annotated[int, Range(0, 1 << 31, below=True)] = 20
     # a primitive that was seen in this share of the steps between two controls is judged, too: in short runs none is
@@ -164,9 +161,6 @@ class ControlConfig:
     # price that pruning puts on a mean squared change of the training views, in units of the loss
     # (`training/structure/pruning.py`)
     prune_worth: Annotated[float, Range(0, 1e9, above=True, below=True)] = 40.0
-    # discount on the price of a bit in pruning, if training views are few: an anchor that adds little may be all that
-    # one view has
-    prune_less: Share = 0.5
 
 
 @dataclass(frozen=True)
@@ -191,21 +185,8 @@ class TrainingConfig:
     rate: Literal["bits", "elements"] = "bits"
     # share of the run before the rate joins the loss (Ref.: 3 000 of 30 000 steps)
     rate_start: Share = 0.1
-    # the rate is in the loss of every so many-th step, multiplied by as many: latents change little from one step to
-    # the next, and a step without the rate takes a sixth less time (not in the paper)
-    rate_every: Annotated[int, Range(1, 1000)] = 4
-    # share of the run in which photographs of 160 000 pixels and more have their sides halved, larger ones more than
-    # once; 0: never (not in the paper; `training/shortcuts/coarse.py`)
-    coarse_until: Share = 0.7
     # (1 - w) L1 + w (1 - SSIM) (3DGS)
     ssim_weight: Share = 0.2
-    # gradients below this share of the mean of a view's primitives are sampled on the CPU, and scaled up to match;
-    # 0: none are; 1 is faster, and loses detail (not in the paper; `tensors/gradient_sampling.py`)
-    sampled_gradients: Annotated[float, Range(0, 100)] = 0.1
-    # a step skips anchors that were hidden when its view was last rendered, with gradients below this share of the
-    # mean; steps with the rate render all of them; 0: none are skipped (not in the paper;
-    # `training/shortcuts/hidden.py`)
-    passed_over: Share = 0.03
     # weight of the mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
     scale_weight: Annotated[float, Range(0, 1e6, below=True)] = 0.01
     # learning rate of the embeddings at the start and at the end, in quantization steps per training step
@@ -236,8 +217,6 @@ class TrainingConfig:
     # true: learn an affine change of color for each training view, beside the scene, for photographs of differing
     # exposure or white balance; the file does not hold it (`training/step/exposures.py`)
     exposure: bool = False
-    # share of the primitives that a step leaves out at random, if training views are few
-    left_out: Annotated[float, Range(0, 0.5)] = 0.2
     # cameras of training views that the file keeps, at most: one for each 100 anchors, and three at least; 0: none
     viewpoints: Annotated[int, Range(0, MAX_VIEWPOINTS)] = 12
     # minutes between two checkpoints; one is also written when the run is interrupted
@@ -337,6 +316,7 @@ def config_from_dict(values: dict[str, Any], place: str = "settings", kind: type
     values out of range.
     """
     hints = typing.get_type_hints(kind)
+    values = without_former(values, place)
     unknown = sorted(set(values) - set(hints))
     if unknown:
         raise ConfigError(f"{place}: unknown section {unknown[0]!r}; known: {', '.join(hints)}")
@@ -362,8 +342,6 @@ def check_config(config: Config) -> None:
             expected = wrong_value(value, hint)
             if expected:
                 raise ConfigError(f"{section.name}.{name} = {value!r}: expected {expected}")
-    if config.training.rules == "none":
-        _check_no_rule_is_set(config)
     if config.model.point_colors and config.model.reference_dim < 3:
         raise ConfigError(
             f"model.point_colors = True: needs a model.reference_dim of 3 or more, found {config.model.reference_dim}"
@@ -373,31 +351,6 @@ def check_config(config: Config) -> None:
             f"splats.reset_opacity = {config.splats.reset_opacity}: expected more than "
             f"splats.prune_opacity, {config.splats.prune_opacity}"
         )
-
-
-# What rules of training read, and what it is without them.
-_OF_RULES: dict[str, float] = {
-    "model.voxel_rate_exponent": 0.0,
-    "control.rate_exponent": 0.0,
-    "control.prune_less": 0.0,
-    "training.left_out": 0.0,
-    "training.coarse_until": 0.0,
-    "training.rate_every": 1,
-    "training.sampled_gradients": 0.0,
-    "training.passed_over": 0.0,
-}
-
-
-def _check_no_rule_is_set(config: Config) -> None:
-    """Raises ConfigError for a setting that only a rule reads, and that is asked for where no rule is applied."""
-    usual = Config()
-    for setting, without in _OF_RULES.items():
-        section, name = setting.split(".")
-        value = getattr(getattr(config, section), name)
-        if value not in (without, getattr(getattr(usual, section), name)):
-            raise ConfigError(
-                f"{setting} = {value!r}: without rules it is {without}; set training.rules = 'all' as well"
-            )
 
 
 def wrong_value(value: Any, hint: Any) -> str:

@@ -69,8 +69,8 @@ def test_a_record_of_todays_preset_is_not_outdated_and_one_of_another_is() -> No
     fresh = {**record, "settings": settings, "plan": plan(config, start).to_dict()}
     assert figures.outdated(fresh) == []
     assert figures.outdated({**fresh, "plan": {**fresh["plan"], "width": 8}}) == ["width"]
-    other = {**fresh["settings"], "training": {**fresh["settings"]["training"], "rate_start": 0.5}}
-    assert figures.outdated({**fresh, "settings": other}) == ["training.rate_start"]
+    other = {**fresh["settings"], "training": {**fresh["settings"]["training"], "ssim_weight": 0.5}}
+    assert figures.outdated({**fresh, "settings": other}) == ["training.ssim_weight"]
 
 
 @pytest.mark.parametrize("path", RECORDS, ids=lambda path: path.stem)

@@ -1,10 +1,9 @@
 """Settings for a scene small enough to train in a second."""
 
 import pytest
+from rules import SIZES_AS_SET
 
 from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig
-
-SIZES_AS_SET = "all but width_16, width_8, no_context, one_bit_less, two_bits_less"
 
 
 @pytest.fixture
@@ -19,6 +18,5 @@ def tiny_config() -> Config:
             voxel_size=0.1,
         ),
         control=ControlConfig(start=0.2, stop=0.7, every=0.2, minimum_views=4, gradient_threshold=1e-5),
-        # Networks of a hundred anchors would be small, and all that tests look at of other sizes.
         training=TrainingConfig(steps=40, seed=3, rules=SIZES_AS_SET),
     )

@@ -41,8 +41,7 @@ CONFIG = Config(
         seed=3,
         views_per_step=2,
         exposure=True,
-        left_out=0.1,
-        sampled_gradients=0.0,
+        rules="all but sampled_gradients",
         rate_start=0.0,
     ),
 )

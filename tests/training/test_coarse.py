@@ -78,8 +78,10 @@ def test_a_step_renders_and_compares_as_coarsely_as_its_share_of_the_run_asks(
     blob_scene: Scene, tiny_config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("compgs.training.plan.COARSE_PIXELS", 48 * 36)
-    config = replace(tiny_config, training=replace(tiny_config.training, steps=20, coarse_until=0.5))
+    config = replace(tiny_config, training=replace(tiny_config.training, steps=20))
     trainer = Trainer(blob_scene, config, CPU)
+    assert trainer.coarse.until == 0.7
+    trainer.coarse.until = 0.5
     sizes = []
     for _ in range(20):
         view = trainer.views.order[-1] if trainer.views.order else None

@@ -110,12 +110,13 @@ def test_a_scene_whose_anchors_are_all_transparent_keeps_them(blob_scene, tiny_c
 
 
 def test_an_anchor_has_to_add_more_where_bits_weigh_more(tiny_config):
-    config = replace(tiny_config, control=replace(tiny_config.control, rate_exponent=0.5))
+    """With the cube root of lambda."""
+    config = tiny_config
     assert growth_factor(config, 0.002) == pytest.approx(1)
-    assert growth_factor(config, 0.008) == pytest.approx(2)
+    assert growth_factor(config, 0.016) == pytest.approx(2)
     assert growth_factor(config, 0.0) == growth_factor(config, 1e-6) < 0.1  # without a rate, too, growth ends
-    flat = replace(config, control=replace(config.control, rate_exponent=0.0))
-    assert growth_factor(flat, 0.008) == 1
+    flat = replace(config, training=replace(config.training, rules="all but growth"))
+    assert growth_factor(flat, 0.016) == 1
 
 
 def test_the_schedule_scales_with_the_run(tiny_config):
@@ -304,9 +305,7 @@ def act(control: AdaptiveControl, model: TrainedModel, means, lmbda: float = 0.0
     assert all(len(getattr(control, name)) == model.anchors for name in control.STATISTICS)
 
 
-CERTAIN = ControlConfig(
-    gradient_threshold=1.0, growth_probabilities=(1.0, 1.0, 1.0), minimum_views=10, rate_exponent=0.5
-)
+CERTAIN = ControlConfig(gradient_threshold=1.0, growth_probabilities=(1.0, 1.0, 1.0), minimum_views=10)
 LONG = ControlSchedule(start=100, stop=1_000, every=100)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from rules import without
 
 import compgs
 from compgs import metrics
@@ -65,7 +66,9 @@ def small(config: Config) -> Config:
         config,
         model=replace(config.model, voxel_size=0.125),
         control=replace(config.control, start=1.0, stop=0.0, prune_at=()),
-        training=replace(config.training, steps=30, sampled_gradients=0.0),
+        training=replace(
+            config.training, steps=30, rules=without(config.training.rules, "sampled_gradients")
+        ),
     )
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from rules import without
 
 import compgs
 from compgs.cameras import Camera
@@ -115,7 +116,7 @@ def test_each_option_takes_its_steps_on_the_gpus_path(gpu_path, blob_scene, tiny
 
 
 def test_the_gpus_path_learns_as_the_kernels_do(blob_scene, tiny_config, gpu_path, monkeypatch):
-    config = small(tiny_config, sampled_gradients=0.0, passed_over=0.0)
+    config = small(tiny_config, rules=without(tiny_config.training.rules, "sampled_gradients"))
     losses = []
     for _ in range(2):  # first by torch, then by kernels
         seen: list[float] = []

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from compgs.tensors.gradient_sampling import GradientSizes
 from compgs.tensors.rasterize import rasterize
+from compgs.training.shortcuts.gradient_sampling import GradientSizes
 from compgs.training.shortcuts.hidden import HiddenAnchors
 from compgs.training.step.step_views import step_views
 from compgs.training.survey import predict_view
@@ -120,7 +120,7 @@ def test_what_one_rank_remembers_comes_back_and_is_of_no_use_to_several():
 
 @pytest.fixture
 def trainer(blob_scene, tiny_config):
-    training = replace(tiny_config.training, steps=120, passed_over=0.03, rate_every=4)
+    training = replace(tiny_config.training, steps=120)
     found = Trainer(blob_scene, replace(tiny_config, training=training), CPU)
     for _ in range(61):
         found.train_step()

@@ -121,7 +121,9 @@ def test_voxels_are_larger_where_bits_are_dear(lmbda: float, spacings: float) ->
     """By the sixth root of lambda / 0.002, as far as growth follows lambda."""
     config = replace(Config(), training=replace(Config().training, lmbda=lmbda))
     assert grid_spacings(config) == pytest.approx(spacings, rel=1e-4)
-    assert grid_spacings(replace(config, model=replace(config.model, voxel_rate_exponent=0.0))) == 1.5
+    assert (
+        grid_spacings(replace(config, training=replace(config.training, rules="all but coarser_grid"))) == 1.5
+    )
 
 
 def test_a_run_starts_on_the_grid_that_its_lambda_asks_for(blob_scene: Scene, tiny_config: Config) -> None:

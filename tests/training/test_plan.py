@@ -166,12 +166,6 @@ def test_rules_that_do_not_exist_are_refused_by_name(rules: str) -> None:
         plan(asked(rules=rules), USUAL)
 
 
-def test_a_setting_that_only_a_rule_reads_is_refused_without_rules() -> None:
-    paper = load_config("paper")
-    with pytest.raises(ConfigError, match="rate_every"):
-        compgs.config.check_config(replace(paper, training=replace(paper.training, rate_every=8)))
-
-
 def test_smaller_networks_that_were_asked_for_stay() -> None:
     config = replace(Config(), model=replace(Config().model, width=8))
     assert {plan(config, start).width for start in STARTS} == {8}

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from rules import without
 
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
@@ -24,8 +25,9 @@ CPU = torch.device("cpu")
 
 
 def with_pruning(config: Config, worth: float, at: tuple[float, ...]) -> Config:
-    control = replace(config.control, prune_worth=worth, prune_less=0.0, prune_at=at)  # as with many views
-    return replace(config, control=control)
+    control = replace(config.control, prune_worth=worth, prune_at=at)
+    rules = without(config.training.rules, "bit_discount")  # as with many views
+    return replace(config, control=control, training=replace(config.training, rules=rules))
 
 
 def trained(scene: Scene, config: Config) -> Trainer:

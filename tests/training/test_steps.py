@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from rules import SIZES_AS_SET, without
 
 from compgs.config import Config
 from compgs.render import render
@@ -20,11 +21,9 @@ STEPS = 20
 # symbols.
 CERTAIN = {
     "steps": STEPS,
-    "left_out": 0.0,
-    "sampled_gradients": 0.0,
+    "rules": without(SIZES_AS_SET, "dropout", "sampled_gradients", "rate_every"),
     "hard_rate": 0.0,
     "rate_start": 0.0,
-    "rate_every": 1,
 }
 
 
@@ -199,7 +198,8 @@ def test_where_views_are_few_a_step_does_without_some_primitives(
 ) -> None:
     images = {}
     for share in (0.0, 0.4):
-        trainer = started(blob_scene, with_training(tiny_config, **{**CERTAIN, "left_out": share}))
+        trainer = started(blob_scene, with_training(tiny_config, **CERTAIN))
+        trainer.gradients.plan = replace(trainer.plan, dropout=share)
         view = trainer.scene.train_views[2]
         complete = torch.as_tensor(
             render(trainer.model.as_hybrid_model(stored_weights=False), view.camera).image
@@ -223,9 +223,10 @@ def test_the_rate_is_in_the_loss_of_every_few_steps_as_many_times(
 ) -> None:
     found = {}
     for every in (1, 3):
-        config = with_training(tiny_config, **{**CERTAIN, "rate_every": every, "lmbda": 10.0})
+        config = with_training(tiny_config, **{**CERTAIN, "lmbda": 10.0})
         for step in (2, 3, 4):
             trainer = started(blob_scene, config, step)
+            trainer.plan = replace(trainer.plan, rate_every=every)
             l1, similarity, _, _ = parts_of_loss(trainer, trainer.scene.train_views[2])
             found[every, step] = float(trainer.train_step().loss) - 0.8 * l1 - 0.2 * (1 - similarity)
     assert found[3, 3] == pytest.approx(3 * found[1, 3], rel=1e-3)

@@ -117,7 +117,7 @@ def test_a_trainers_camera_is_as_large_as_what_its_step_looks_at(
     cameras = [view.camera for view in large]
     for progress in (0.0, 0.3, 0.65, 0.9):
         found = trainer.coarse.usual(cameras, progress)
-        times = halvings(progress, config.training.coarse_until, 800, 600)
+        times = halvings(progress, trainer.plan.coarse_until, 800, 600)
         assert (found.width, found.height) == (800 // 2**times, 600 // 2**times)
     assert usual_camera(cameras, 4).width == 200
 

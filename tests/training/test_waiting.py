@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from rules import without
 
 from compgs.config import Config
 from compgs.entropy.neighbourhood import neighbourhood
@@ -72,7 +73,8 @@ def test_culling_needs_no_values(blob_scene):
 
 def test_leaving_nothing_out_trains_the_same_model(blob_scene, tiny_config, monkeypatch):
     # All gradients: what a sample of them is depends on how many primitives there are.
-    config = replace(tiny_config, training=replace(tiny_config.training, sampled_gradients=0.0))
+    rules = without(tiny_config.training.rules, "sampled_gradients")
+    config = replace(tiny_config, training=replace(tiny_config.training, rules=rules))
     losses = []
     for pays in (True, False):
         monkeypatch.setattr(where, "choosing_pays", lambda device, pays=pays: pays)

@@ -15,9 +15,8 @@ import compgs
 from compgs.cameras import Camera
 from compgs.codec.reader import read_content
 from compgs.codec.writer import write_content
-from compgs.formats import open_tiles
 from compgs.formats.tiled import read_manifest
-from compgs.formats.tiled_scene import TiledScene
+from compgs.formats.tiled_scene import TiledScene, open_tiles
 from compgs.formats.tiled_writer import NewTile, write_tiles
 from compgs.metrics import psnr, to_8bit
 from compgs.ordering.order import canonical_order, level_counts

@@ -7,6 +7,7 @@ from typing import Any
 
 from compgs.cli.usage import OPTIONS, UsageError, settings_of_options
 from compgs.config import Config, config_from_dict
+from compgs.former_settings import FORMER
 from compgs.methods import Method
 
 
@@ -29,6 +30,9 @@ def with_settings(config: Config, assignments: Iterable[str]) -> Config:
                 f"--set {assignment}: there is no section {section!r}; there are {', '.join(kinds)}"
             )
         hints = typing.get_type_hints(kinds[section])
+        if f"{section}.{key}" in FORMER:
+            instead = FORMER[f"{section}.{key}"].instead
+            raise UsageError(f"--set {assignment}: {key!r} is no setting any more; {instead}")
         if key not in hints:
             raise UsageError(
                 f"--set {assignment}: there is no setting {key!r}; {section} has {', '.join(hints)}"

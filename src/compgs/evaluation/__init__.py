@@ -3,7 +3,7 @@
 | file | does |
 |---|---|
 | `measure`, `results` | measures a file on held-out views: `evaluate`, and what it returns |
-| `comparison` | puts two files of one scene side by side, without photographs |
+| `comparison`, `compared_files` | put two files of one scene side by side, without photographs |
 | `reduction` | makes a file smaller without training, and measures what that loses |
 | `bd_rate` | compares two curves of quality over bytes |
 | `held_out`, `fit`, `exposure` | checks the views before they are measured, and adjusts their exposure |

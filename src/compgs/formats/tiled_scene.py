@@ -12,12 +12,13 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from compgs.cameras import Camera
 from compgs.codec.decoder import decode_bytes
-from compgs.devices import CPU, Device, check_device, drawn
+from compgs.devices import CPU, check_device, drawn
 from compgs.errors import ConfigError, CorruptSection
 from compgs.formats.tile_detail import levels_with_whole, wanted_levels
 from compgs.formats.tiled import COPY, Manifest, Vector, check, read_manifest, tile_bytes
@@ -29,6 +30,9 @@ from compgs.render.render_model import DrawsItself
 from compgs.render.result import RasterResult
 from compgs.render.settings import DEFAULT_SETTINGS, RasterSettings
 from compgs.render.visibility import visible_mask
+
+if TYPE_CHECKING:
+    from compgs.devices import Device
 
 ASKED_BY = "COMPGS_TILES_MEMORY"  # environment variable: bytes of open tiles
 SHARE = 0.5  # of the machine's memory that open tiles may take where nobody says otherwise

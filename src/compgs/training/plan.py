@@ -42,9 +42,21 @@ LOOKED_AT, PRUNED_BY = 48, 256
 # Pixels of the photographs between two points that are found in them before a large capture's run: 65 000 points on
 # Truck, half as many as it has. Without them walls and trees stay blurred (docs/results/truck.md).
 POINTS_APART = 12.0
-COARSE_PIXELS = (
-    160_000  # a photograph of so many pixels, and of more, is halved at first (`shortcuts/coarse.py`)
-)
+# What the rules decide by, where it is no yes or no. Voxels grow with a power of lambda / 0.002 above it, the gradient
+# that asks for a new anchor with another: anchors cost bits.
+VOXEL_EXPONENT, GROWTH_EXPONENT = 1 / 6, 1 / 3
+# Where training views are few: share of the primitives that a step does without, and by which pruning counts a bit as
+# cheaper, as what adds little may be all that one view has.
+FEW_VIEWS_DROPOUT, FEW_VIEWS_DISCOUNT = 0.2, 0.5
+# The shortcuts (`training/shortcuts`). Photographs of so many pixels, and of more, are halved until a share of the run.
+COARSE_PIXELS, COARSE_UNTIL = 160_000, 0.7
+# Steps from one with the rate to the next: latents change little meanwhile, and a step without takes a sixth less time.
+RATE_EVERY = 4
+# Of the mean gradient of a view's primitives: of smaller ones only a sample goes on. With 1 steps are faster still, and
+# the scene loses detail.
+SAMPLED_GRADIENTS = 0.1
+# Of the mean gradient: anchors whose primitives have less are passed over.
+PASSED_OVER = 0.03
 
 
 @dataclass(frozen=True)
@@ -106,22 +118,22 @@ class Rule:
 
 def growth_factor(config: Config, lmbda: float) -> float:
     """Factor on the gradient that asks for a new anchor: anchors cost bits. It follows lambda in a run."""
-    if "growth" not in (rule.name for rule in active_rules(config)):
+    if not in_force("growth", config):
         return 1.0
     least, most = LAMBDA_RANGE
-    return (min(max(lmbda, least), most) / USUAL_LAMBDA) ** config.control.rate_exponent
+    return (min(max(lmbda, least), most) / USUAL_LAMBDA) ** GROWTH_EXPONENT
 
 
 def _voxels(config: Config, start: Start, spacings: float) -> float:
     dearer = min(start.lmbda, LAMBDA_RANGE[1]) / USUAL_LAMBDA
-    return spacings * max(1.0, dearer) ** config.model.voxel_rate_exponent
+    return spacings * max(1.0, dearer) ** VOXEL_EXPONENT
 
 
 # Where two rules set the same value, the later one goes on from what the earlier one chose.
 RULES: tuple[Rule, ...] = (
     Rule(
         "coarser_grid", "voxel_spacings", _voxels,
-        "lambda above 0.002: voxels grow with its power model.voxel_rate_exponent",
+        "lambda above 0.002: voxels grow with its sixth root",
         lambda s: s.lmbda > USUAL_LAMBDA,
         "results/decisions.md",
     ),
@@ -214,45 +226,45 @@ RULES: tuple[Rule, ...] = (
     # Followed in a run, as lambda changes (`growth_factor`).
     Rule(
         "growth", "growth_threshold", lambda c, s, threshold: threshold * growth_factor(c, s.lmbda),
-        "always: it goes with the power control.rate_exponent of lambda / 0.002",
+        "always: it goes with the cube root of lambda / 0.002",
         lambda s: True,
         "results/decisions.md",
     ),
     Rule(
-        "dropout", "dropout", lambda c, s, share: c.training.left_out * s.fewness,
-        "fewer than 30 training views: training.left_out where 15 or fewer",
+        "dropout", "dropout", lambda c, s, share: FEW_VIEWS_DROPOUT * s.fewness,
+        "fewer than 30 training views: 0.2 where 15 or fewer",
         lambda s: s.fewness > 0,
         "results/decisions.md",
     ),
     Rule(
-        "bit_discount", "bit_discount", lambda c, s, share: c.control.prune_less * s.fewness,
-        "fewer than 30 training views: control.prune_less where 15 or fewer",
+        "bit_discount", "bit_discount", lambda c, s, share: FEW_VIEWS_DISCOUNT * s.fewness,
+        "fewer than 30 training views: 0.5 where 15 or fewer",
         lambda s: s.fewness > 0,
         "results/decisions.md",
     ),
     Rule(
-        "coarse_photographs", "coarse_until", lambda c, s, share: c.training.coarse_until,
-        "photographs of 160,000 pixels and more: until training.coarse_until of the run",
+        "coarse_photographs", "coarse_until", lambda c, s, share: COARSE_UNTIL,
+        "photographs of 160,000 pixels and more: until 0.7 of the run",
         lambda s: s.pixels >= COARSE_PIXELS,
         "results/decisions.md",
     ),
     Rule(
-        "rate_every", "rate_every", lambda c, s, steps: c.training.rate_every,
-        "always: training.rate_every",
+        "rate_every", "rate_every", lambda c, s, steps: RATE_EVERY,
+        "always",
         lambda s: True,
         "results/decisions.md",
     ),
     Rule(
-        "sampled_gradients", "sampled_gradients", lambda c, s, share: c.training.sampled_gradients,
-        "on the CPU: training.sampled_gradients",
+        "sampled_gradients", "sampled_gradients", lambda c, s, share: SAMPLED_GRADIENTS,
+        "on the CPU",
         lambda s: s.device == "cpu",
         "results/decisions.md",
     ),
     # Several processes must look at the same anchors, and each would know of its own views alone.
     Rule(
         "hidden_anchors", "passed_over",
-        lambda c, s, share: c.training.passed_over if c.training.sampled_gradients > 0.0 else 0.0,
-        "on the CPU in one process: training.passed_over, where gradients are sampled",
+        lambda c, s, share: PASSED_OVER if in_force("sampled_gradients", c) else 0.0,
+        "on the CPU in one process, where gradients are sampled",
         lambda s: s.device == "cpu" and s.processes == 1,
         "results/decisions.md",
     ),
@@ -407,6 +419,11 @@ def active_rules(config: Config) -> tuple[Rule, ...]:
             f"training.rules = {asked!r}: expected all, none, or all but some of {', '.join(known)}"
         )
     return tuple(rule for rule in RULES if rule.name not in without)
+
+
+def in_force(name: str, config: Config) -> bool:
+    """Whether `training.rules` leaves a rule in force."""
+    return any(rule.name == name for rule in active_rules(config))
 
 
 def pruning_views(views: int) -> int:

@@ -127,4 +127,4 @@ def initial_anchors(kind: type[AnchorModel], scene: Scene, config: Config) -> An
 
 def control_settings(config: Config) -> Config:
     """Return settings for `AdaptiveControl` with which nothing is pruned or weighed by a rate."""
-    return replace(config, control=replace(config.control, rate_exponent=0.0))
+    return replace(config, training=replace(config.training, rules="none"))

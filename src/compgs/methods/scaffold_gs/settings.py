@@ -23,7 +23,6 @@ PUBLISHED: Mapping[str, Mapping[str, Any]] = {
         "opacity_share": 0.8,
         "growth_probabilities": (0.5, 0.75, 0.875),
         "finer_needs_coarser": True,
-        "rate_exponent": 0.0,
     },
     "training": {
         "schedule": "exponential",

@@ -1,13 +1,13 @@
 """Anchors that a view does not show, though they are in its frustum: they stand behind others.
 
 A third of the anchors in view hardly show, and cost as much as the others until their gradients turn out to be nothing.
-Each view remembers which they were; its next steps pass them over. In every `training.rate_every`-th step, the one that
+Each view remembers which they were; its next steps pass them over. In every step with the rate (`rare_rate`), which
 counts the bits of all anchors in view, all are looked at again: on average at every fourth visit of a view
 (docs/results/tried.md). Before there is a rate, much is hidden now and seen soon: then all are looked at.
 
 What counts is not the gradient by an anchor's latents, of which a sample is left, but those by its primitives
-(`tensors/gradient_sampling.py`). Something that shows always has some: L1 pulls at every value by as much, however
-small the error is.
+(`gradient_sampling.py`). Something that shows always has some: L1 pulls at every value by as much, however small the
+error is.
 """
 
 from collections.abc import Mapping
@@ -19,9 +19,9 @@ from torch import Tensor
 from compgs.gaussians import Gaussians
 from compgs.losses import FEW_DRAWN
 from compgs.numerics.compiled import njit
-from compgs.tensors.gradient_sampling import GradientSizes
 from compgs.tensors.prediction import Prediction
 from compgs.training.run.restoring import check_tensor
+from compgs.training.shortcuts.gradient_sampling import GradientSizes
 
 
 class HiddenAnchors:

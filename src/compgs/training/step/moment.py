@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from compgs.config import TrainingConfig
 from compgs.training.plan import Plan
+from compgs.training.shortcuts.rare_rate import times_counted
 
 
 @dataclass(frozen=True)
@@ -22,15 +23,13 @@ class Moment:
 
 
 def moment(step: int, lmbda: float, training: TrainingConfig, plan: Plan, *, watched: bool) -> Moment:
-    """Find what is due in a step. The rate joins the loss at `rate_start`, in every `plan.rate_every`-th step; the
-    others pass over hidden anchors.
-    """
-    progress = step / training.steps
-    joined, counted = progress >= training.rate_start, step % plan.rate_every == 0
+    """Find what is due in a step. Once the rate has joined the loss, steps without it pass over hidden anchors."""
+    progress, counted = step / training.steps, times_counted(step, plan.rate_every)
+    joined = progress >= training.rate_start
     return Moment(
         progress=progress,
         lmbda=lmbda,
-        rate_weight=plan.rate_every if joined and counted else 0,
+        rate_weight=counted if joined else 0,
         passes_over=joined and not counted,
         hard=progress >= training.hard_rate,
         stored=progress >= training.quantized_weights,

@@ -16,12 +16,12 @@ from compgs.entropy import Quantized
 from compgs.gaussians import Gaussians
 from compgs.render import RasterResult
 from compgs.scene.views import Scene
-from compgs.tensors.gradient_sampling import GradientSizes, with_sampled_gradients
 from compgs.tensors.prediction import Geometry, Prediction, geometry_of_all
 from compgs.trained_model import TrainedModel
 from compgs.training.plan import Plan
 from compgs.training.run.status import StepResult
 from compgs.training.shortcuts.coarse import CoarseViews
+from compgs.training.shortcuts.gradient_sampling import GradientSizes, with_sampled_gradients
 from compgs.training.shortcuts.hidden import HiddenAnchors
 from compgs.training.step.dropout import thinned
 from compgs.training.step.latents import pull_back

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from compgs.gaussians import Gaussians
-from compgs.tensors.gradient_sampling import GradientSizes, with_sampled_gradients
+from compgs.training.shortcuts.gradient_sampling import GradientSizes, with_sampled_gradients
 
 M = 400
 NAMES = ("means", "quaternions", "scales", "opacities", "colors")
