@@ -51,7 +51,7 @@ def of_one_rank(rank: int, anchors: int, repeats: int, folder: Path) -> dict[str
 
     from compgs.config import Config
     from compgs.trained_model import TrainedModel
-    from compgs.training.run.distributed import check_identical, on_any_rank, sum_gradients, whole
+    from compgs.training.run.distributed import check_identical, on_any_rank, sum_gradients, summed_over_ranks
     from compgs.training.structure.control import AdaptiveControl, make_schedule
 
     dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
@@ -72,7 +72,7 @@ def of_one_rank(rank: int, anchors: int, repeats: int, folder: Path) -> dict[str
     statistics = AdaptiveControl.STATISTICS
 
     def gather() -> None:
-        with whole(control, statistics):
+        with summed_over_ranks(control, statistics):
             pass
 
     return {

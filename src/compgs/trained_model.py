@@ -21,7 +21,7 @@ from compgs.model.head_weights import HeadDimensions
 from compgs.model.hybrid_model import HybridModel
 from compgs.stored_weights import StoredWeights
 from compgs.tensors.heads import make_heads
-from compgs.tensors.linear import Reader
+from compgs.tensors.linear import ReferenceLayer
 from compgs.tensors.primitives import Primitives, every_slot
 
 
@@ -220,7 +220,7 @@ class TrainedModel(nn.Module):
             "mask": self.mask.new_ones(new, self.mask.shape[1]),
         }
 
-    def readers(self) -> Iterator[Reader]:
+    def readers(self) -> Iterator[ReferenceLayer]:
         """The layers that take the references."""
         yield from self.heads.readers(self.config.entropy.reference_step)
         yield from self.entropy.readers()

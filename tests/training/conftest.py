@@ -1,9 +1,10 @@
 """Settings for a scene small enough to train in a second."""
 
 import pytest
-from rules import SIZES_AS_SET
 
 from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig
+
+from .rules import SIZES_AS_SET
 
 
 @pytest.fixture

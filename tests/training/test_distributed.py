@@ -149,12 +149,12 @@ def test_a_rank_that_ends_ends_the_others_with_one_line(found: dict[str, Any]) -
 
 def test_alone_nothing_is_sent_and_nothing_changes(blob_scene: Scene, tiny_config: Config) -> None:
     trainer = Trainer(blob_scene, tiny_config, torch.device("cpu"))
-    assert (distributed.world(), distributed.rank(), distributed.mine([4, 5])) == (1, 0, [4, 5])
+    assert (distributed.world(), distributed.rank(), distributed.share_of_rank([4, 5])) == (1, 0, [4, 5])
     assert distributed.on_any_rank(True, False) == (True, False)
     trainer.control.seen += 3
-    with distributed.whole(trainer.control, ["seen"]):
+    with distributed.summed_over_ranks(trainer.control, ["seen"]):
         pass
-    distributed.leave_to_first(trainer.control, ["seen"])
+    distributed.keep_on_rank_zero(trainer.control, ["seen"])
     assert (trainer.control.seen == 3).all()
     parameter = torch.nn.Parameter(torch.zeros(2))
     distributed.sum_gradients([parameter])

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from rules import without
 
 import compgs
 from compgs import metrics
@@ -24,6 +23,8 @@ from compgs.training.run.checkpoint import CHECKPOINT_NAME
 from compgs.training.run.model_checkpoint import load_checkpoint
 from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
+
+from .rules import without
 
 CPU = torch.device("cpu")
 SHIFT = (4.2e6, 5.1e5, 3e3)  # metres

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from rules import without
 
 import compgs
 from compgs.cameras import Camera
@@ -14,6 +13,8 @@ from compgs.render.settings import DEFAULT_SETTINGS
 from compgs.tensors import gsplat_backend, where
 from compgs.tensors.reference import Splats, composite, project
 from compgs.training.trainer import train
+
+from .rules import without
 
 
 class StandIn:

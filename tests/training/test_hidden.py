@@ -131,7 +131,7 @@ def test_steps_with_the_rate_look_at_all_and_others_at_what_showed(trainer):
     seen = []
     for _ in range(8):
         views, step = trainer.views, trainer.step
-        looks = trainer.look(trainer.now)
+        looks = trainer.views_of_step(trainer.now)
         (view,) = looks.views
         everything = trainer.survey.visible_anchors(trainer.scene.train_views[view].camera)
         shown = everything if step % 4 == 0 else trainer.hidden.others(view, everything)

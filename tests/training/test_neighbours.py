@@ -55,7 +55,7 @@ def test_the_network_of_the_neighbours_learns_and_latents_do_not_learn_from_it(
     before = {name: p.detach().clone() for name, p in network.named_parameters()}
     trainer.step = 12  # the rate is in the loss
     now = trainer.now
-    looks = trainer.look(now)
+    looks = trainer.views_of_step(now)
     trainer.learn(looks, now)
     gradients = trainer.model.references.grad
     assert gradients is not None and network.follow.grad is not None

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from rules import without
 
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
@@ -20,6 +19,8 @@ from compgs.training.rate.rate_control import RateState
 from compgs.training.shortcuts.coarse import halved
 from compgs.training.structure.pruning import judged, paying, random_signs, squared_changes
 from compgs.training.trainer import Trainer
+
+from .rules import without
 
 CPU = torch.device("cpu")
 

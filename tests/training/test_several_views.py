@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rules import SIZES_AS_SET, without
 
 from compgs.config import Config, ControlConfig, SplatConfig
 from compgs.errors import ConfigError
@@ -16,6 +15,8 @@ from compgs.training.step.step_views import noise_of_some, seen_anchors
 from compgs.training.step.views_in_turn import ViewsInTurn
 from compgs.training.structure.control import make_schedule
 from compgs.training.trainer import Trainer
+
+from .rules import SIZES_AS_SET, without
 
 CPU = torch.device("cpu")
 # Nothing is left to chance: no primitive is left out, no gradient, and the likelihood sees symbols.

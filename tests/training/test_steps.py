@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from rules import SIZES_AS_SET, without
 
 from compgs.config import Config
 from compgs.render import render
@@ -14,6 +13,8 @@ from compgs.scene.views import Scene, View
 from compgs.tensors.ssim import ssim
 from compgs.training.rate.rate_control import RateState
 from compgs.training.trainer import Trainer
+
+from .rules import SIZES_AS_SET, without
 
 CPU = torch.device("cpu")
 STEPS = 20

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rules import without
 
 from compgs.config import Config
 from compgs.entropy.neighbourhood import neighbourhood
@@ -18,6 +17,8 @@ from compgs.tensors.visibility import visible_mask
 from compgs.training.step import pictures
 from compgs.training.survey import Survey
 from compgs.training.trainer import Trainer
+
+from .rules import without
 
 META = torch.device("meta")
 

@@ -13,7 +13,7 @@ from compgs.config import Config
 from compgs.methods import train
 from compgs.metrics import to_8bit
 from compgs.scene.views import Scene
-from compgs.training.run.trains import Trains
+from compgs.training.run.any_trainer import AnyTrainer
 from compgs.viewer.shown import GrowingShown
 from compgs.viewer.stage import SpareTime
 from compgs.viewer.visitor import Look, Picture, Visitor, lens_of
@@ -56,7 +56,7 @@ class Watched:
         self.thread.start()
         self.steps: list[int] = []
 
-    def __call__(self, trainer: Trains) -> None:
+    def __call__(self, trainer: AnyTrainer) -> None:
         self.steps.append(trainer.step)
         self.shown.grown(trainer.step, trainer.snapshot)
         while self.stage._jobs.empty():  # until the visitor asks for something
@@ -96,7 +96,7 @@ def test_a_snapshot_stays_as_it_was_taken(blob_scene: Scene, tiny_config: Config
     taken: list[Callable[[], np.ndarray]] = []
     seen: list[np.ndarray] = []
 
-    def look(trainer: Trains) -> None:
+    def look(trainer: AnyTrainer) -> None:
         snapshot = trainer.snapshot()
         taken.append(lambda: to_8bit(compgs.render(snapshot, camera).image))
         seen.append(taken[-1]())

@@ -11,8 +11,8 @@ from compgs.cli.usage import UsageError, check_range
 
 if TYPE_CHECKING:
     from compgs.scene import Scene
+    from compgs.training.run.any_trainer import AnyTrainer
     from compgs.training.run.status import TrainingStatus
-    from compgs.training.run.trains import Trains
     from compgs.viewer.live import LiveViewer
     from compgs.viewer.shown import GrowingShown, Shown
     from compgs.viewer.stage import SpareTime, Stage
@@ -62,7 +62,7 @@ class Viewing:
     def address(self) -> str:
         return self.viewer.address
 
-    def __call__(self, trainer: "Trains") -> None:
+    def __call__(self, trainer: "AnyTrainer") -> None:
         """Render what visitors wait for, as far as there is time for it."""
         self.shown.grown(trainer.step, trainer.snapshot)
         self.stage.tend()

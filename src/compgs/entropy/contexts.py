@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from compgs.entropy.factorized import FactorizedDensity
 from compgs.entropy.network import leaky
 from compgs.entropy.quantization import round_straight_through
-from compgs.tensors.linear import Reader, linear
+from compgs.tensors.linear import ReferenceLayer, linear
 
 Noise = Callable[[Tensor], Tensor]
 
@@ -51,10 +51,10 @@ class Hyperprior(nn.Module):
         """Symbols that it adds to an anchor, by stream."""
         return {self.stream: self.outputs}
 
-    def readers(self) -> Iterator[Reader]:
+    def readers(self) -> Iterator[ReferenceLayer]:
         """The layers that take the embedding."""
         first = self.analysis.first
-        yield Reader(first.weight, first.bias, 1, 0, 1.0)
+        yield ReferenceLayer(first.weight, first.bias, 1, 0, 1.0)
 
     def forward(self, y: Tensor) -> Tensor:
         """z [N, channels] of the embeddings y [N, inputs], in quantization steps, before it is rounded."""
@@ -90,7 +90,7 @@ class NoContext(nn.Module):
     outputs = 3
     channels: ClassVar[dict[str, int]] = {}
 
-    def readers(self) -> Iterator[Reader]:
+    def readers(self) -> Iterator[ReferenceLayer]:
         """No layer takes the embedding."""
         return iter(())
 

@@ -20,7 +20,7 @@ from compgs.entropy.contexts import Hyperprior, NoContext
 from compgs.entropy.neighbour_network import NeighbourNetwork
 from compgs.entropy.network import EntropyNetwork
 from compgs.ordering.neighbours import BESIDES
-from compgs.tensors.linear import Reader
+from compgs.tensors.linear import ReferenceLayer
 
 STREAMS = ("reference_hyper", "reference", "covariance", "residual_hyper", "residual")
 
@@ -147,7 +147,7 @@ class EntropyModel(nn.Module):
         network.biases[-1][:channels] = float(values.mean()) / (step * network.gain[0])
         network.biases[-1][channels:] = (max(float(values.std(ddof=1)), 0.1) / step).log2()
 
-    def readers(self) -> Iterator[Reader]:
+    def readers(self) -> Iterator[ReferenceLayer]:
         """The layers that take the references."""
         yield from self.reference_context.readers()
         yield from self.covariance_network.readers(0)
@@ -253,7 +253,7 @@ class OwnResidualsEntropyModel(EntropyModel):
         own = {**self.residual_hyperprior.channels, "residual": self.residual_channels}
         return {**super().channels, **own}
 
-    def readers(self) -> Iterator[Reader]:
+    def readers(self) -> Iterator[ReferenceLayer]:
         yield from super().readers()
         yield from self.residual_network.readers(0)
 

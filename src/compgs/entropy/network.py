@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from compgs.entropy.quantization import quantize_weight
-from compgs.tensors.linear import Reader, linear
+from compgs.tensors.linear import ReferenceLayer, linear
 
 # A power of two, so that the decoder's leaky ReLU is a shift.
 NEGATIVE_SLOPE = 2.0**-6
@@ -93,12 +93,12 @@ class EntropyNetwork(nn.Module):
         """Parameters [C] beside the last layer's rows."""
         return ()
 
-    def readers(self, first: int) -> Iterator[Reader]:
+    def readers(self, first: int) -> Iterator[ReferenceLayer]:
         """The layers that take the input; what is meant begins at its channel `first`."""
-        yield Reader(self.weights[0], self.biases[0], 1, first, 1.0)
+        yield ReferenceLayer(self.weights[0], self.biases[0], 1, first, 1.0)
         if self.blocks:
             skip = len(self.biases[0]) + first
-            yield Reader(self.weights[-1], self.biases[-1], 1, skip, 1.0)
+            yield ReferenceLayer(self.weights[-1], self.biases[-1], 1, skip, 1.0)
 
     def keep_channels(self, kept: Tensor) -> None:
         """Follow the last layer's weights and biases, which have lost the rows of all channels but those `kept` [C]."""

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from compgs.model.splats import SplatModel
     from compgs.scene.views import Scene
     from compgs.training.plan import Plan
+    from compgs.training.run.any_trainer import Watch
     from compgs.training.run.profile import StepProfile
     from compgs.training.run.status import TrainingStatus
-    from compgs.training.run.trains import Watch
 
 
 def method_of(name: str) -> Method:

@@ -18,7 +18,7 @@ from compgs.gaussians import Gaussians
 from compgs.model.head_weights import NETWORKS, HeadDimensions, HeadWeights, Layout
 from compgs.tensors import where
 from compgs.tensors.autograd import PairedPrediction
-from compgs.tensors.linear import Reader
+from compgs.tensors.linear import ReferenceLayer
 from compgs.tensors.prediction import Heads, Prediction
 from compgs.tensors.primitives import Primitives
 from compgs.tensors.residual_mlp import ResidualMLP
@@ -53,11 +53,11 @@ class PredictionHeads(Heads):
             assert isinstance(network, ResidualMLP)
             yield name, network
 
-    def readers(self, reference_step: float) -> Iterator[Reader]:
+    def readers(self, reference_step: float) -> Iterator[ReferenceLayer]:
         """The layers that take the references."""
         for _, network in self.networks():
-            yield Reader(network.input_weight, network.input_bias, 0, 0, reference_step)
-            yield Reader(network.skip_weight, network.output_bias, 0, 0, reference_step)
+            yield ReferenceLayer(network.input_weight, network.input_bias, 0, 0, reference_step)
+            yield ReferenceLayer(network.skip_weight, network.output_bias, 0, 0, reference_step)
 
 
 class PairedHeads(PredictionHeads):

@@ -20,11 +20,11 @@ PARTS = 16
 
 
 @dataclass(frozen=True)
-class Reader:
-    """A linear layer that takes references, among other things: weight, and what it adds to in the layer."""
+class ReferenceLayer:
+    """A linear layer with the reference embedding among its inputs."""
 
     weight: Tensor
-    bias: Tensor
+    bias: Tensor  # what the layer adds to the products
     dimension: int  # of the weight: its inputs
     first: int  # input that is the references' first channel
     unit: float  # what the layer takes a quantization step of them for

@@ -31,7 +31,7 @@ from compgs.tensors.prediction import (
 from compgs.tensors.visibility import visible_mask
 from compgs.trained_model import TrainedModel
 from compgs.training.plan import LOOKED_AT
-from compgs.training.run.distributed import mine, sum_over_ranks
+from compgs.training.run.distributed import share_of_rank, sum_over_ranks
 from compgs.training.run.restoring import check_tensor
 from compgs.training.structure.importance import spread, view_contributions
 from compgs.training.structure.pruning import judged, squared_changes
@@ -147,7 +147,7 @@ class Survey:
 
     def contributions(self, most: int = LOOKED_AT) -> Tensor:
         """[N, K] float64: what the coupled primitives add to the training views, or to at most `most` of them."""
-        views = mine(spread(self.scene.train_views, most))
+        views = share_of_rank(spread(self.scene.train_views, most))
         total = view_contributions(views, self.predicted, self.shape, self.settings, self.model.device)
         sum_over_ranks(total)
         return total
@@ -158,7 +158,7 @@ class Survey:
         """
         views = self.scene.train_views
         cameras = [judged(view.camera) for view in spread(views, most)]
-        numbered = mine(
+        numbered = share_of_rank(
             [(self.step() * len(cameras) + number, camera) for number, camera in enumerate(cameras)]
         )
         total, shown_by = squared_changes(

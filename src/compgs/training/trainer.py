@@ -21,7 +21,7 @@ from compgs.training.optimizers import make_optimizer
 from compgs.training.plan import Plan
 from compgs.training.rate.rate_control import RateState
 from compgs.training.run.checkpoint import checkpoint_of
-from compgs.training.run.distributed import mine
+from compgs.training.run.distributed import share_of_rank
 from compgs.training.run.model_checkpoint import METHOD, described, model_of
 from compgs.training.run.parts import Part
 from compgs.training.run.scene_trainer import SceneTrainer
@@ -57,19 +57,18 @@ class Trainer(SceneTrainer):
     ) -> None:
         super().__init__(scene, config, device, METHOD)
         t, views = config.training, len(scene.train_views)
-        model = self.model = self.trained = (model or initial_model(scene, config, device, planned)).to(
-            device
-        )
+        model = (model or initial_model(scene, config, device, planned)).to(device)
+        self.model = self.trained = model
         scene = self.scene = local_scene(scene, model.world_offset)
         plan = self.plan = plan_of(model, scene, device)
         self.settings = RasterSettings(background=scene.background, angular_dilation=model.angular_dilation)
+        self.survey = Survey(model, scene, self.settings, lambda: self.step)
         self.optimizer = make_optimizer(model, t)
         self.schedule = make_schedule(config.control, t.steps, views, t.views_per_step)
-        shape = model.anchors, model.dimensions.coupled_primitives
-        self.hidden = HiddenAnchors(plan.passed_over, views, shape, device)
-        self.control = AdaptiveControl(config, self.schedule, shape, device, (self.hidden.replaced,))
+        self.hidden = HiddenAnchors(plan.passed_over, views, self.survey.shape, device)
+        follow = (self.hidden.replaced,)
+        self.control = AdaptiveControl(config, self.schedule, self.survey.shape, device, follow)
         self.noise = UniformNoise(t.seed + 3, self.views.chance, device)
-        self.survey = Survey(model, scene, self.settings, lambda: self.step)
         self.rate = RateState(t.lmbda)
         self.coarse = CoarseViews(self.views, plan.coarse_until)
         self.pictures = Pictures(self.settings, t.ssim_weight)
@@ -77,16 +76,15 @@ class Trainer(SceneTrainer):
         self.gradients = ViewGradients(
             model, scene, t, plan, self.pictures, self.coarse, self.hidden, self.control
         )
-        self.structure = Structure(
-            config, plan, model, self.optimizer, self.survey, self.control, self.chance
-        )
+        tools = self.optimizer, self.survey, self.control, self.chance
+        self.structure = Structure(config, plan, model, *tools)
 
     # one step ------------------------------------------------------------------------------------------------------
 
     def train_step(self) -> StepResult:
-        """Quantize, predict, rasterize, compare, pull (the paper's Fig. 2 from left to right); then move."""
+        """Quantize, predict, rasterize, compare (the paper's Fig. 2 from left to right), go back; then move."""
         now = self.now
-        views = self.look(now)
+        views = self.views_of_step(now)
         if len(views.seen.rows) == 0:  # nothing can be learned from views that no anchor is in
             self.finish_step()
             return self.nothing_shown(views)
@@ -101,7 +99,7 @@ class Trainer(SceneTrainer):
         """What the phases of the run ask of the step that comes next."""
         return moment(self.step, self.rate.lmbda, self.config.training, self.plan, watched=self.watched)
 
-    def look(self, now: Moment) -> StepViews:
+    def views_of_step(self, now: Moment) -> StepViews:
         """Choose the views of this step, and the anchors that they may show. The rate is of all of these; steps without
         it pass over those that were hidden.
         """
@@ -119,7 +117,7 @@ class Trainer(SceneTrainer):
         shown = latents.cut()
         results = self.gradients.learn(shown, views, now)
         rate = self.latents.rate_of(latents, views, now)
-        self.latents.pull(latents, shown, rate, now.lmbda)
+        self.latents.backward_latents(latents, shown, rate, now.lmbda)
         self.latents.learn_neighbours(latents, views)
         loss = torch.stack([result.loss for result in results]).sum()
         if rate is not None and now.lmbda > 0:
@@ -128,7 +126,8 @@ class Trainer(SceneTrainer):
 
     def nothing_shown(self, views: StepViews) -> StepResult:
         """The result of a step of which this rank sees nothing but background."""
-        return nothing_shown(self.views.photograph(mine(views.views)[-1]), self.scene.background, self.device)
+        last = share_of_rank(views.views)[-1]
+        return nothing_shown(self.views.photograph(last), self.scene.background, self.device)
 
     def move(self) -> None:
         """Adam's step; each channel of the references by its own rate."""

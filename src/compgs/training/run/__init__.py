@@ -4,7 +4,7 @@
 |---|---|
 | `run` | where a run writes, on which device, and who looks on |
 | `scene_trainer` | what all trainers have, each kind of which adds its step |
-| `trains`, `status` | what the loop needs of a trainer, and what it tells |
+| `any_trainer`, `status` | what the loop needs of a trainer, and what it tells |
 | `loop` | goes through the steps, reports progress, and stops at any time |
 | `saving`, `pace` | when a checkpoint is due, and how fast steps are |
 | `parts` | what a run remembers, written once for all trainers |

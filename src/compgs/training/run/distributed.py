@@ -79,15 +79,15 @@ def joined(device: torch.device) -> Iterator[None]:
 # what they share -------------------------------------------------------------------------------
 
 
-def mine(things: Sequence[_T]) -> Sequence[_T]:
-    """This rank's share: every so-manieth."""
+def share_of_rank(things: Sequence[_T]) -> Sequence[_T]:
+    """Every n-th of the things, of n ranks: those that this rank looks at."""
     return things[rank() :: world()] if world() > 1 else things
 
 
 def sum_over_ranks(*tensors: Tensor) -> None:
     """Each of the tensors [...], which are changed, over all ranks. Raises TrainingError if one is gone."""
     if world() > 1:
-        with _journey():
+        with _communication_errors():
             for work in [dist.all_reduce(tensor, async_op=True) for tensor in tensors]:
                 work.wait()
 
@@ -97,7 +97,7 @@ def on_any_rank(*flags: bool) -> tuple[bool, ...]:
     if world() == 1:
         return flags
     counts = torch.tensor(flags, dtype=torch.int32)
-    with _journey():
+    with _communication_errors():
         dist.all_reduce(counts)
     return tuple(count > 0 for count in counts.tolist())
 
@@ -125,7 +125,7 @@ def sum_gradients(parameters: Iterable[nn.Parameter], *others: Tensor) -> None:
 
 
 @contextmanager
-def whole(owner: Any, names: Iterable[str]) -> Iterator[None]:
+def summed_over_ranks(owner: Any, names: Iterable[str]) -> Iterator[None]:
     """Inside, the statistics `names` of their owner are those of all ranks.
 
     Outside each rank has gathered a part, and their sum is what counts: to send them at every step would double what
@@ -133,11 +133,11 @@ def whole(owner: Any, names: Iterable[str]) -> Iterator[None]:
     """
     sum_over_ranks(*(getattr(owner, name) for name in names))
     yield
-    leave_to_first(owner, names)
+    keep_on_rank_zero(owner, names)
 
 
-def leave_to_first(owner: Any, names: Iterable[str]) -> None:
-    """Statistics that all ranks have alike are rank 0's part: see `whole`."""
+def keep_on_rank_zero(owner: Any, names: Iterable[str]) -> None:
+    """Zero the statistics on all ranks but 0, so that summing them again counts them once."""
     if rank() > 0:
         for name in names:
             getattr(owner, name).zero_()
@@ -149,7 +149,7 @@ def check_identical(step: int, tensors: Mapping[str, Tensor]) -> None:
         return
     own = torch.tensor([digest(tensor) for tensor in tensors.values()], dtype=torch.int64)
     found = [torch.empty_like(own) for _ in range(world())]
-    with _journey():
+    with _communication_errors():
         dist.all_gather(found, own)
     for number, digests in enumerate(found):
         for name, differs in zip(tensors, (digests != found[0]).tolist(), strict=True):
@@ -183,8 +183,8 @@ def digest(tensor: Tensor) -> int:
 
 
 @contextmanager
-def _journey() -> Iterator[None]:
-    """Whatever goes wrong between ranks: raises TrainingError."""
+def _communication_errors() -> Iterator[None]:
+    """Turn an error of the communication inside into a TrainingError."""
     try:
         yield
     except RuntimeError as error:

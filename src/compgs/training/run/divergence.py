@@ -5,4 +5,6 @@ from compgs.errors import TrainingError
 
 def diverged(step: int, what: str, value: float) -> TrainingError:
     """The error to raise for a value that is not finite any more."""
-    return TrainingError(f"step {step}: the {what} is {value}; try a lower learning rate or another seed")
+    return TrainingError(
+        f"step {step}: the {what} is {value}; try another seed, or smaller learning rates (settings in _lr)"
+    )

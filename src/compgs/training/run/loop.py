@@ -8,13 +8,13 @@ import torch
 from compgs.config import TrainingConfig
 from compgs.interrupt import held_back
 from compgs.training.run.allocation import freed_memory_kept
+from compgs.training.run.any_trainer import AnyTrainer, Watch
 from compgs.training.run.distributed import rank, stopping_together, world
 from compgs.training.run.divergence import diverged
 from compgs.training.run.pace import Pace
 from compgs.training.run.saving import Saving
 from compgs.training.run.status import StepResult, TrainingStatus, training_psnr
 from compgs.training.run.time_left import TimeLeft
-from compgs.training.run.trains import Trains, Watch
 
 REPORT_EVERY = 10  # steps between two status reports
 ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it may look at every primitive
@@ -22,7 +22,7 @@ ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it may l
 
 @freed_memory_kept()
 def run_to_end(
-    trainer: Trains,
+    trainer: AnyTrainer,
     config: TrainingConfig,
     path: Path | None,
     on_progress: Callable[[TrainingStatus], None] | None,
@@ -65,7 +65,7 @@ def run_to_end(
 
 
 def _status(
-    trainer: Trains, steps: int, result: StepResult, estimate: int, pace: float, left: TimeLeft
+    trainer: AnyTrainer, steps: int, result: StepResult, estimate: int, pace: float, left: TimeLeft
 ) -> TrainingStatus:
     return TrainingStatus(
         step=trainer.step,

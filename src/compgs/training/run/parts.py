@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from compgs.training.run.checkpoint import optimizer_tensors, restore_optimizer
-from compgs.training.run.distributed import leave_to_first
+from compgs.training.run.distributed import keep_on_rank_zero
 from compgs.training.run.restoring import check_moments, check_tensor
 
 
@@ -102,4 +102,4 @@ class Statistics:
             value, now = tensors[f"control/{name}"], getattr(self.control, name)
             check_tensor(value, now.shape, now.dtype, f"control/{name}")
             setattr(self.control, name, value.to(now.device))
-        leave_to_first(self.control, self.names)
+        keep_on_rank_zero(self.control, self.names)

@@ -24,7 +24,7 @@ _MISFITS = (
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """What goes wrong inside is the fault of the checkpoint at `path`: raises CheckpointError."""
+    """Turn any error inside into a CheckpointError for `path`."""
     try:
         yield
     except CheckpointError:

@@ -9,11 +9,11 @@ from compgs import devices
 from compgs.config import Config, check_config, load_config
 from compgs.errors import ConfigError
 from compgs.training.plan import Plan
+from compgs.training.run.any_trainer import Watch
 from compgs.training.run.checkpoint import CHECKPOINT_NAME
 from compgs.training.run.distributed import local_device
 from compgs.training.run.profile import StepProfile
 from compgs.training.run.status import TrainingStatus
-from compgs.training.run.trains import Watch
 
 
 class Run:

@@ -4,9 +4,9 @@ import time
 from pathlib import Path
 
 from compgs.interrupt import held_back
+from compgs.training.run.any_trainer import AnyTrainer
 from compgs.training.run.checkpoint import Writer
 from compgs.training.run.distributed import on_any_rank
-from compgs.training.run.trains import Trains
 
 
 class Saving:
@@ -19,7 +19,7 @@ class Saving:
     checkpoint needs all of them.
     """
 
-    def __init__(self, trainer: Trains, path: Path | None, minutes: float) -> None:
+    def __init__(self, trainer: AnyTrainer, path: Path | None, minutes: float) -> None:
         self.trainer = trainer
         self.path = path
         self.writer = Writer()
@@ -46,7 +46,7 @@ class Saving:
         return self.saved - start
 
     def begin(self) -> float:
-        """Let a checkpoint be written while the run goes on; seconds that it waited."""
+        """Start writing a checkpoint in the background. Returns the seconds spent waiting."""
         self.begun = self.path is not None
         return self.save(self.writer)
 

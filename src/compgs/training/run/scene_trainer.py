@@ -14,15 +14,15 @@ from compgs.gaussians import Gaussians
 from compgs.render import RasterResult, RasterSettings, Renderable
 from compgs.scene.views import Scene
 from compgs.training.optimizers import DECAYS, parameters_of, set_learning_rates
+from compgs.training.run.any_trainer import Watch
 from compgs.training.run.checkpoint import Checkpoint, Writer, write_checkpoint
-from compgs.training.run.distributed import check_identical, sum_gradients, whole
+from compgs.training.run.distributed import check_identical, sum_gradients, summed_over_ranks
 from compgs.training.run.loop import run_to_end
 from compgs.training.run.parts import Chance, Memory, Part, Statistics
 from compgs.training.run.restoring import restoring
 from compgs.training.run.run import Run
 from compgs.training.run.seen_points import check_points_seen
 from compgs.training.run.status import StepResult, TrainingStatus
-from compgs.training.run.trains import Watch
 from compgs.training.shortcuts.coarse import usual_camera
 from compgs.training.step.pictures import Pictures
 from compgs.training.step.views_in_turn import ViewsInTurn
@@ -170,7 +170,7 @@ class SceneTrainer(ABC):
 
     def save(self, path: Path | None, writer: Writer | None = None) -> None:
         """Write a checkpoint, or let the writer do it. On all ranks at once; None on those that do not write."""
-        with whole(self.control, self.control.STATISTICS):
+        with summed_over_ranks(self.control, self.control.STATISTICS):
             if path is not None:
                 write_checkpoint(path, self.method, self.checkpoint(), writer, device=self.device)
 

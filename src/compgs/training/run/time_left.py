@@ -20,7 +20,7 @@ from compgs.render.render_model import Renderable, settings_of
 from compgs.tensors.rasterize import rasterize
 
 if TYPE_CHECKING:
-    from compgs.training.run.trains import Trains
+    from compgs.training.run.any_trainer import AnyTrainer
 
 POINTS = 200  # steps of a run, evenly spaced, that stand for all
 MOST_SIZES = 6  # that are drawn at once
@@ -36,7 +36,7 @@ class TimeLeft:
 
     def __init__(
         self,
-        trainer: "Trains",
+        trainer: "AnyTrainer",
         steps: int,
         views: int = 1,  # of a step, of this process
         draws: "Callable[[Renderable, Camera], float] | None" = None,

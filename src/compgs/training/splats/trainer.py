@@ -26,7 +26,7 @@ from compgs.tensors.splats import Splats, splat_gaussians, splat_radii
 from compgs.tensors.visibility import visible_mask
 from compgs.training.optimizers import exponential_decay, rates_for, set_learning_rates
 from compgs.training.run.checkpoint import checkpoint_of
-from compgs.training.run.distributed import mine, whole
+from compgs.training.run.distributed import share_of_rank, summed_over_ranks
 from compgs.training.run.parts import Part
 from compgs.training.run.restoring import check_tensor, finite, restoring
 from compgs.training.run.scene_trainer import SceneTrainer
@@ -138,7 +138,7 @@ class SplatTrainer(SceneTrainer):
     def train_step(self) -> StepResult:
         """Activate, rasterize, compare, pull, for each view; then move, and control density."""
         views = self.views.next()
-        results = [self.learn_from(view) for view in mine(views)]
+        results = [self.learn_from(view) for view in share_of_rank(views)]
         loss = torch.stack([result.loss for result in results]).sum()
         self.update(views, loss)
         self.step += 1
@@ -193,7 +193,7 @@ class SplatTrainer(SceneTrainer):
         """What the schedule asks for after so many steps."""
         if self.schedule.due(self.step):
             large = self.step > self.schedule.reset_every
-            with whole(self.control, DensityControl.STATISTICS):
+            with summed_over_ranks(self.control, DensityControl.STATISTICS):
                 kept, added, origins = self.control.chosen(
                     self.parameters.trained(), self.as_drawn(), self.chance, remove_large=large
                 )

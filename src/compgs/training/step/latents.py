@@ -1,8 +1,8 @@
-"""Latents of a step: quantized before its views are drawn, and pulled at by distortion and rate afterwards.
+"""Latents of a step: quantized before its views are drawn, and moved by distortion and rate afterwards.
 
 anchors ──quantize──► latents ──cut──► views ──► gradients ─┐
    ▲                     │                                  │
-   └──────── pull ◄──────┴── bits ──► rate ──── x lambda ───┘
+   └───── backward ◄─────┴── bits ──► rate ──── x lambda ───┘
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,9 @@ class StepLatents:
         rates = [rate(part.bits, channels, self.normalization) for part in parts]
         return now.rate_weight * torch.stack(rates).sum()
 
-    def pull(self, latents: Quantized, shown: Quantized, rate: Tensor | None, lmbda: float) -> None:
+    def backward_latents(
+        self, latents: Quantized, shown: Quantized, rate: Tensor | None, lmbda: float
+    ) -> None:
         """Backpropagate D + lambda R (Eq. 1): what the views ask of the latents, and what the rate does, go through the
         entropy model to the anchors. With lambda 0 only the entropy model learns R.
         """
@@ -55,7 +57,7 @@ class StepLatents:
         elif rate is not None:
             rate.backward(inputs=self.model.entropy.statistics(), retain_graph=True)
             rate = None
-        pull_back(latents.latents(), shown.latents(), rate)
+        pass_gradients_back(latents.latents(), shown.latents(), rate)
 
     def learn_neighbours(self, latents: Quantized, views: StepViews) -> None:
         """Backpropagate what the references cost given their neighbours, as in the file: only the neighbours' network
@@ -67,7 +69,9 @@ class StepLatents:
         torch.stack([bits.mean() for bits in parts if bits is not None]).sum().backward()
 
 
-def pull_back(tensors: Sequence[Tensor], leaves: Sequence[Tensor], loss: Tensor | None = None) -> None:
+def pass_gradients_back(
+    tensors: Sequence[Tensor], leaves: Sequence[Tensor], loss: Tensor | None = None
+) -> None:
     """Lead the gradients of `leaves`, which were cut from the `tensors`, and those of a `loss` [] on through the graph
     of these.
     """

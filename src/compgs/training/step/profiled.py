@@ -17,7 +17,7 @@ PARTS = {
     "gradients.regularize": "loss",
     "pictures.backward": "prediction, backward",
     "latents.rate_of": "entropy",
-    "latents.pull": "entropy, backward",
+    "latents.backward_latents": "entropy, backward",
     "latents.learn_neighbours": "entropy, backward",
     "update": "optimizer",
     "gradients.observe": "control",

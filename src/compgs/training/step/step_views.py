@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from compgs.entropy.quantization import UniformNoise
-from compgs.training.run.distributed import mine
+from compgs.training.run.distributed import share_of_rank
 
 Noise = Callable[[Tensor], Tensor]  # of the shape of what it is given
 
@@ -79,7 +79,7 @@ def step_views(
     several = len(views) > 1
     seed = int(noise.places.integers(1 << 62)) if several else None
     seen = seen_anchors(dict(enumerate(rows)), anchors)
-    numbers = mine(range(len(views)))
+    numbers = share_of_rank(range(len(views)))
     all_mine = len(numbers) == len(views)
     own = seen if all_mine else seen_anchors({number: rows[number] for number in numbers}, anchors)
     return StepViews(tuple(views), seen, own, noise, seed)

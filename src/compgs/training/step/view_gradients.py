@@ -24,7 +24,7 @@ from compgs.training.shortcuts.coarse import CoarseViews
 from compgs.training.shortcuts.gradient_sampling import GradientSizes, with_sampled_gradients
 from compgs.training.shortcuts.hidden import HiddenAnchors
 from compgs.training.step.dropout import thinned
-from compgs.training.step.latents import pull_back
+from compgs.training.step.latents import pass_gradients_back
 from compgs.training.step.moment import Moment
 from compgs.training.step.pictures import Pictures, vanishing_loss, volume_loss
 from compgs.training.step.step_views import Noise, StepViews
@@ -61,7 +61,7 @@ class ViewGradients:
         geometry = self.predict_shared(shown, views.own.rows, now)
         cut = geometry.cut()
         yield cut
-        pull_back(geometry.tensors(), cut.tensors())
+        pass_gradients_back(geometry.tensors(), cut.tensors())
 
     def predict_shared(self, shown: Quantized, rows: Tensor, now: Moment) -> Geometry:
         """Predict the geometry of all primitives of the anchors in `rows` [U] int64."""

@@ -12,7 +12,7 @@ from compgs.training.plan import Plan, head_bits
 from compgs.training.rate.file_size import anchor_bits
 from compgs.training.rate.rate_control import RateState
 from compgs.training.rate.target_size import TargetSize
-from compgs.training.run.distributed import whole
+from compgs.training.run.distributed import summed_over_ranks
 from compgs.training.run.parts import Part
 from compgs.training.structure.averaging import Averaging
 from compgs.training.structure.control import AdaptiveControl
@@ -81,7 +81,7 @@ class Structure:
 
     def grow(self, step: int, rate: RateState) -> None:
         """Add anchors where the image's gradient is large, and remove those that nobody sees."""
-        with whole(self.control, AdaptiveControl.STATISTICS):
+        with summed_over_ranks(self.control, AdaptiveControl.STATISTICS):
             means = self.survey.coupled_means()
             self.control.act(self.model, self.optimizer, means, self.chance, rate.lmbda)
 

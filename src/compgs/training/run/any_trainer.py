@@ -10,7 +10,7 @@ from compgs.training.run.checkpoint import Writer
 from compgs.training.run.status import StepResult
 
 
-class Trains(Protocol):
+class AnyTrainer(Protocol):
     """State of a run, at a step."""
 
     step: int
@@ -47,4 +47,4 @@ class Trains(Protocol):
 
 
 # Called between any two steps, for whoever wants to look at the scene as it grows.
-Watch = Callable[[Trains], None]
+Watch = Callable[[AnyTrainer], None]
