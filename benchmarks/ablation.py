@@ -90,7 +90,7 @@ STUDIES: dict[str, tuple[Variant, ...]] = {
         Variant(
             "never_rounded",
             "trained unrounded, rounded for the file",
-            _set("entropy.quantized=false", "training.quantized_weights=1"),
+            _set("entropy.quantized=false", "training.phases=0.05,0.1,0.8,1,0.9"),
             unrounded=True,
         ),
     ),

@@ -48,7 +48,7 @@ def train(folder: Path) -> Any:
     scene = compgs.load_scene(folder / "scene")
     settings = (
         f"training.steps={os.environ.get('STEPS', '1')}",
-        "training.rate_start=0.2",
+        "training.phases=0.05,0.2,0.8,0.8,0.9",
         "control.start=0.2",
     )
     return compgs.train(scene, with_settings(load_config("default"), settings), device="cpu")

@@ -72,7 +72,8 @@ def breakdown(options: argparse.Namespace) -> dict[str, Any]:
     """Milliseconds by part on a real scene."""
     from compgs.config import Config
     from compgs.scene import load_scene
-    from compgs.training.run.checkpoint import CHECKPOINT_NAME, load_checkpoint
+    from compgs.training.run.checkpoint import CHECKPOINT_NAME
+    from compgs.training.run.model_checkpoint import load_checkpoint
     from compgs.training.run.profile import WARM_UP, StepProfile
 
     scene = load_scene(options.scene[0], downscale=options.downscale[0])

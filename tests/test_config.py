@@ -1,13 +1,16 @@
 import dataclasses
 import math
 import typing
+from dataclasses import asdict
 from typing import Annotated, Literal
 
 import pytest
 
-from compgs.config import PRESETS, Config, Range, config_from_dict, load_config, wrong_value
+from compgs.config import PRESETS, Config, Phases, Range, config_from_dict, load_config, wrong_value
 from compgs.errors import ConfigError
 from compgs.former_settings import FORMER
+from compgs.former_settings import VARIANTS as FORMER_VARIANTS
+from compgs.training.structure.variants import VARIANTS
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -33,22 +36,15 @@ def test_an_unknown_preset_is_named_with_the_known_ones():
         ("training", "steps", 0),
         ("training", "ssim_weight", 7.0),
         ("training", "embedding_lr", [math.nan, 1e-4]),
-        ("training", "color_lr", [-1e-3, 1e-4]),
+        ("training", "head_lr", -1.0),
+        ("training", "phases", [0.1, 0.2, 0.3, 0.4]),
+        ("training", "phases", [0.1, 0.2, 0.3, 0.4, math.nan]),
+        ("control", "variant", "ours"),
         ("training", "entropy_lr", [1e-3]),
-        ("training", "quantized_weights", math.nan),
-        ("training", "checkpoint_minutes", math.nan),
         ("training", "rate", "words"),
         ("control", "start", math.nan),
         ("control", "growth_probabilities", [0.5, 0.5, 7.0]),
         ("control", "growth_probabilities", [0.5, 0.5]),
-        ("control", "start_passes", 0.0),
-        ("control", "every_passes", math.nan),
-        ("control", "observe_passes", -1.0),
-        ("control", "minimum_share", 0.0),
-        ("control", "opacity_views", 0),
-        ("control", "opacity_share", -0.1),
-        ("control", "reset_all", 1.0),
-        ("control", "finer_needs_coarser", "yes"),
         ("entropy", "network_blocks", -3),
         ("entropy", "network_width", 10**8),
         ("entropy", "reference_step", 0.0),
@@ -120,13 +116,28 @@ def test_settings_of_earlier_versions_are_read_where_nothing_has_changed() -> No
     for name, former in FORMER.items():
         section, key = name.split(".")
         assert key not in values[section]
-        for value in former.values:
+        for value in former.values or ():
             older = {**values, section: {**values[section], key: value}}
             assert config_from_dict(older) == Config()
 
 
+def test_shares_of_a_run_that_were_settings_of_their_own_are_its_phases() -> None:
+    training = {"rate_start": 0.2, "hard_rate": 1.0, "averaged": 0.25}
+    found = config_from_dict({"training": training})
+    assert found.training.borders == Phases(warm=0.05, rate=0.2, symbols=1.0, weights=0.8, mean=0.75)
+
+
+def test_the_control_of_earlier_versions_is_one_of_the_variants() -> None:
+    assert {name: asdict(variant) for name, variant in VARIANTS.items()} == FORMER_VARIANTS
+    for name, settings in FORMER_VARIANTS.items():
+        assert config_from_dict({"control": dict(settings)}).control.variant == name
+    with pytest.raises(ConfigError, match=r"no control[.]variant has all these values"):
+        config_from_dict({"control": {"opacity_views": 7}})
+
+
 def test_settings_of_earlier_versions_that_would_matter_are_refused_with_what_to_do() -> None:
-    values = Config().to_dict()
-    values["training"]["rate_every"] = 8
-    with pytest.raises(ConfigError, match=r"rate_every = 8 is no setting any more; .*all but rate_every"):
-        config_from_dict(values, "config.json")
+    for section, key, value in (("training", "rate_every", 8), ("training", "color_lr", [1e-3, 1e-4])):
+        values = Config().to_dict()
+        values[section][key] = value
+        with pytest.raises(ConfigError, match=rf"{key} = .* is no setting any more; "):
+            config_from_dict(values, "config.json")

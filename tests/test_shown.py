@@ -79,7 +79,7 @@ def test_settings_are_their_preset_and_what_differs(preset: str) -> None:
 
 def test_of_many_settings_that_differ_some_are_shown() -> None:
     config = Config()
-    several = replace(config.training, seed=1, lmbda=0.5, averaged=0.2, head_warm_up=0.1, viewpoints=3)
+    several = replace(config.training, seed=1, lmbda=0.5, head_lr=0.2, ssim_weight=0.1, viewpoints=3)
     assert repr(replace(config, training=several)).endswith(", and 2 more)")
     assert len(repr(replace(config, training=several))) < LONGEST
 

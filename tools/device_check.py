@@ -117,7 +117,7 @@ def end_to_end(given: Given) -> dict[str, Any]:
     scene = compgs.load_scene(generated(given, 40, 320, 240))
     steps = 60 if given.quick else 600
     config = load_config("default")
-    config = replace(config, training=replace(config.training, steps=steps, checkpoint_minutes=1e-4))
+    config = replace(config, training=replace(config.training, steps=steps))
     folder = given.out / "end_to_end"
     estimates: list[int] = []
 

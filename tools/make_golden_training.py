@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 import compgs
-from compgs.config import Config, ControlConfig, EntropyConfig, ModelConfig, TrainingConfig
+from compgs.config import Config, ControlConfig, EntropyConfig, ModelConfig, Phases, TrainingConfig
 from compgs.metrics import psnr, to_8bit
 from compgs.render import render
 from compgs.scene.generated import generate_scene
@@ -51,10 +51,9 @@ CONFIG = Config(
         steps=60,
         seed=11,
         target_bytes=2_200,
-        rate_start=0.05,
         # Which gradients are in a sample depends on the last bit of all before them.
         rules="all but sampled_gradients",
-        hard_rate=0.75,
+        phases=Phases(rate=0.05, symbols=0.75),
     ),
 )
 

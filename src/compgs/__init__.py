@@ -37,7 +37,7 @@ _HOME = {
     "compare": "compgs.evaluation",
     "report": "compgs.evaluation.reports",
     "export": "compgs.exporting",
-    "open_scene": "compgs.formats",
+    "open_scene": "compgs.opening",
     "load_config": "compgs.config",
     "Camera": "compgs.cameras",
     "Gaussians": "compgs.gaussians",

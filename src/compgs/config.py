@@ -12,7 +12,7 @@ import types
 import typing
 from dataclasses import dataclass, field
 from importlib import resources
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from compgs.errors import ConfigError
 from compgs.former_settings import without_former
@@ -53,6 +53,16 @@ LearningRate = Annotated[float, Range(0, 100, above=True, below=True)]
 # First and last of a run.
 LearningRates = Annotated[tuple[float, float], Range(0, 100, above=True, below=True)]
 Shares = Annotated[tuple[float, ...], Range(0, 1)]
+
+
+class Phases(NamedTuple):
+    """Shares of a run at which its phases begin, by name: a value of `training.phases`."""
+
+    warm: float = 0.05
+    rate: float = 0.1
+    symbols: float = 0.8
+    weights: float = 0.8
+    mean: float = 0.9
 
 
 @dataclass(frozen=True)
@@ -124,35 +134,21 @@ class ControlConfig:
 
     # share of the run before the first control
     start: Share = 0.15
-    # passes over the training views before the first control, if that is earlier than `start` (Ref.: 5)
-    start_passes: Annotated[float | None, Range(0, 1e6, above=True, below=True)] = None
     # share of the run after which no control comes (Ref.)
     stop: Share = 0.5
     # share of the run between two controls, at least one pass over the training views
     every: Annotated[float, Range(0, 1, above=True)] = 0.05
-    # passes over the training views between two controls, if that is less than `every` (Ref.: 2)
-    every_passes: Annotated[float | None, Range(0, 1e6, above=True, below=True)] = None
-    # passes over the training views before statistics begin, if the first control comes later (Ref.: 3)
-    observe_passes: Annotated[float, Range(0, 1e6, below=True)] = 0.0
     # mean norm of the 2D gradient, in units of half the image
     gradient_threshold: Annotated[float, Range(0, 1e6, above=True, below=True)] = 1e-4
-    # a primitive that was seen less often is not judged (Ref.: more than 40), unless `minimum_share` allows it
+    # a primitive that was seen less often is not judged (Ref.: more than 40), unless `variant` allows it
     minimum_views: Annotated[int, Range(0, 1 << 31, below=True)] = 20
-    # a primitive that was seen in this share of the steps between two controls is judged, too: in short runs none is
-    # seen 40 times. A share above 1 takes several controls, and statistics that outlast them (`reset_all` false).
-    minimum_share: Annotated[float, Range(0, 1e6, above=True, below=True)] = 2.0
     # an anchor with less opacity is removed: the sum over its K primitives, averaged over the views
     opacity_threshold: Annotated[float, Range(0, 1e3, below=True)] = 5e-4
-    # an anchor that was in view less often keeps its place with any opacity (Ref.: 1)
-    opacity_views: Annotated[int, Range(1, 1 << 31, below=True)] = 5
-    # an anchor in view in a smaller share of the steps between two controls keeps its place, too (Ref.: 0)
-    opacity_share: Annotated[float, Range(0, 1e6, below=True)] = 0.1
-    # true: all statistics start anew after a control (Ref.); false: only those of judged primitives
-    reset_all: bool = False
     # probabilities of keeping a candidate for a cell of 16, 4, 1 voxels (Ref.: 0.5, 0.75, 0.875)
     growth_probabilities: Annotated[tuple[float, float, float], Range(0, 1)] = (0.5, 0.25, 0.125)
-    # cells of 4 and 1 voxels are tried only in a control that has grown anchors in larger ones (Ref.: true)
-    finer_needs_coarser: bool = False
+    # way of counting views and passes: ours, that of the authors' release, or of Scaffold-GS
+    # (`training/structure/variants.py`)
+    variant: Literal["default", "published", "scaffold-gs"] = "default"
     # share of all blending weights in the training views: primitives that together add no more are left out of the
     # file
     idle_share: Annotated[float, Range(0, 1, below=True)] = 0.002
@@ -183,44 +179,39 @@ class TrainingConfig:
     # bits: true bits, normalized so that lambda means the same as in the paper; elements: sum over the tensors of mean
     # bits per element (Ref.)
     rate: Literal["bits", "elements"] = "bits"
-    # share of the run before the rate joins the loss (Ref.: 3 000 of 30 000 steps)
-    rate_start: Share = 0.1
+    # shares of the run at which five phases begin: the heads have come up to their learning rates; the rate joins the
+    # loss (Ref.: 3 000 of 30 000 steps); the likelihood sees symbols, not noise (soft then hard); the networks train
+    # with the weights of the file; the mean begins that the file holds (not in the paper; 1: no mean)
+    phases: Annotated[tuple[float, float, float, float, float], Range(0, 1)] = Phases()
     # (1 - w) L1 + w (1 - SSIM) (3DGS)
     ssim_weight: Share = 0.2
     # weight of the mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
     scale_weight: Annotated[float, Range(0, 1e6, below=True)] = 0.01
     # learning rate of the embeddings at the start and at the end, in quantization steps per training step
     embedding_lr: LearningRates = (0.05, 3e-4)
-    # learning rate of the log scales, at the start and at the end (Ref., as the following four)
+    # learning rate of the log scales, at the start and at the end (Ref.)
     log_scale_lr: LearningRates = (0.007, 0.007)
-    translation_lr: LearningRates = (2e-3, 2e-5)
-    covariance_lr: LearningRates = (4e-3, 4e-5)
-    opacity_lr: LearningRates = (2e-3, 2e-5)
-    color_lr: LearningRates = (8e-3, 8e-5)
+    # factor on the published learning rates of the prediction heads (`training/optimizers.py`)
+    head_lr: Positive = 1.0
     # course of all these learning rates (Sec. 4.1; Ref.: exponential)
     schedule: Literal["cosine", "exponential"] = "cosine"
-    # share of the run in which the heads' learning rates rise to their start
-    head_warm_up: Share = 0.05
     # learning rate of the entropy model, at the start and at the end (Ref.: 2e-4 -> 1e-5)
     entropy_lr: LearningRates = (5e-3, 1e-4)
     # steps of the run for which `entropy_lr` is meant: a run of half the steps doubles it, so that the networks get as
     # far; 0: `entropy_lr` as it is
     entropy_lr_steps: Annotated[int, Range(0, 10_000_000)] = 0
-    # share of the run after which the networks train with the weights of the file
-    quantized_weights: Share = 0.8
     # number format of the networks of opacity and color; bfloat16 is meant for GPUs
     appearance_dtype: Literal["float32", "bfloat16"] = "float32"
-    # share of the run after which the likelihood sees symbols, not noise (soft then hard)
-    hard_rate: Share = 0.8
-    # the file holds the mean of this last share of the run; 0: the end of the last step (not in the paper)
-    averaged: Share = 0.1
     # true: learn an affine change of color for each training view, beside the scene, for photographs of differing
     # exposure or white balance; the file does not hold it (`training/step/exposures.py`)
     exposure: bool = False
     # cameras of training views that the file keeps, at most: one for each 100 anchors, and three at least; 0: none
     viewpoints: Annotated[int, Range(0, MAX_VIEWPOINTS)] = 12
-    # minutes between two checkpoints; one is also written when the run is interrupted
-    checkpoint_minutes: Annotated[float, Range(0, 1e6, above=True, below=True)] = 5.0
+
+    @property
+    def borders(self) -> Phases:
+        """The phases of the run by name."""
+        return Phases(*self.phases)
 
 
 @dataclass(frozen=True)

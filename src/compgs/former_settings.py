@@ -1,7 +1,7 @@
 """Settings that there were, so that runs of earlier versions can still be opened, and their settings be understood.
 
-Each entry says what became of the setting. A run's config.json, or its checkpoint, that has one with the value that
-holds now is read as if it had none; any other value is refused with the entry's sentence.
+Some have become one with others; some are constants now. A run's config.json, or its checkpoint, is read with what they
+say today. Where a constant has another value than the run had, it is refused, and the message says what to do.
 """
 
 from collections.abc import Mapping
@@ -15,13 +15,28 @@ from compgs.errors import ConfigError
 class Former:
     """What became of a setting."""
 
-    values: tuple[Any, ...]  # with which nothing has changed
+    values: tuple[Any, ...] | None  # with which nothing has changed; None: any
     instead: str  # what to do now, for people
 
 
 def _of_rule(value: float, without: float, rule: str) -> Former:
     """A setting that only a rule read: it is a constant of `compgs.training.plan` now."""
     return Former((value, without), f"it is {value:.3g}, or off: --set training.rules='all but {rule}'")
+
+
+def _of_heads(*value: float) -> Former:
+    """A learning rate of the heads: they are constants of `compgs.training.optimizers` now."""
+    return Former(
+        (value,), f"it is {value[0]:g} to {value[1]:g}; --set training.head_lr=FACTOR changes all heads'"
+    )
+
+
+def _of_phases(name: str) -> Former:
+    return Former(None, f"it is the border `{name}` of --set training.phases=WARM,RATE,SYMBOLS,WEIGHTS,MEAN")
+
+
+def _of_variant() -> Former:
+    return Former(None, "--set control.variant= default, published or scaffold-gs decides it")
 
 
 FORMER = {
@@ -33,21 +48,107 @@ FORMER = {
     "training.rate_every": _of_rule(4, 1, "rate_every"),
     "training.sampled_gradients": _of_rule(0.1, 0.0, "sampled_gradients"),
     "training.passed_over": _of_rule(0.03, 0.0, "hidden_anchors"),
+    "training.translation_lr": _of_heads(2e-3, 2e-5),
+    "training.covariance_lr": _of_heads(4e-3, 4e-5),
+    "training.opacity_lr": _of_heads(2e-3, 2e-5),
+    "training.color_lr": _of_heads(8e-3, 8e-5),
+    "training.checkpoint_minutes": Former(None, "a checkpoint is written every five minutes"),
+    "training.head_warm_up": _of_phases("warm"),
+    "training.rate_start": _of_phases("rate"),
+    "training.hard_rate": _of_phases("symbols"),
+    "training.quantized_weights": _of_phases("weights"),
+    "training.averaged": _of_phases("mean"),
 }
+# The former settings of `training` that `training.phases` holds now, in its order, with their defaults.
+PHASES = {
+    "head_warm_up": 0.05,
+    "rate_start": 0.1,
+    "hard_rate": 0.8,
+    "quantized_weights": 0.8,
+    "averaged": 0.1,
+}
+# What `control.variant` stands for, in the former settings of `control`.
+VARIANTS: dict[str, dict[str, Any]] = {
+    "default": {
+        "start_passes": None,
+        "every_passes": None,
+        "observe_passes": 0.0,
+        "minimum_share": 2.0,
+        "opacity_views": 5,
+        "opacity_share": 0.1,
+        "reset_all": False,
+        "finer_needs_coarser": False,
+    },
+    "published": {
+        "start_passes": 5.0,
+        "every_passes": 2.0,
+        "observe_passes": 3.0,
+        "minimum_share": 0.2,
+        "opacity_views": 1,
+        "opacity_share": 0.0,
+        "reset_all": True,
+        "finer_needs_coarser": True,
+    },
+    "scaffold-gs": {
+        "start_passes": None,
+        "every_passes": None,
+        "observe_passes": 0.0,
+        "minimum_share": 2.0,
+        "opacity_views": 1,
+        "opacity_share": 0.8,
+        "reset_all": False,
+        "finer_needs_coarser": True,
+    },
+}
+FORMER |= {f"control.{name}": _of_variant() for name in VARIANTS["default"]}
+OF_ANCHORS = (
+    "covariance_lr",
+    "opacity_lr",
+    "color_lr",
+)  # methods with anchors have these in a section of theirs
 
 
 def without_former(values: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """Sections of settings without those that are gone. Raises ConfigError for one whose value would matter."""
-    found: dict[str, Any] = {}
-    for section, settings in values.items():
-        if not isinstance(settings, Mapping):
-            found[section] = settings
-            continue
-        for key, value in settings.items():
+    """Sections of settings in today's words. Raises ConfigError for a former one whose value would matter."""
+    sections = {name: dict(s) if isinstance(s, Mapping) else s for name, s in values.items()}
+    control, training = sections.get("control"), sections.get("training")
+    if isinstance(control, dict):
+        _name_variant(control, place)
+    if isinstance(training, dict):
+        _gather_phases(training)
+        if isinstance(sections.get("anchors"), dict):
+            sections["anchors"] |= {name: training.pop(name) for name in OF_ANCHORS if name in training}
+    for section, settings in sections.items():
+        for key in [*settings] if isinstance(settings, dict) else ():
             former = FORMER.get(f"{section}.{key}")
-            if former is not None and value not in former.values:
+            if former is None:
+                continue
+            value = settings.pop(key)
+            known = tuple(value) if isinstance(value, list) else value
+            if former.values is not None and known not in former.values:
                 raise ConfigError(
                     f"{place}: [{section}] {key} = {value!r} is no setting any more; {former.instead}"
                 )
-        found[section] = {key: value for key, value in settings.items() if f"{section}.{key}" not in FORMER}
-    return found
+    return sections
+
+
+def _name_variant(control: dict[str, Any], place: str) -> None:
+    """Put the name of a variant of control in the place of what it decides. Raises ConfigError if there is none."""
+    said = {name: control.pop(name) for name in VARIANTS["default"] if name in control}
+    if not said:
+        return
+    whole = {**VARIANTS["default"], **said}
+    found = next((name for name, variant in VARIANTS.items() if variant == whole), None)
+    if found is None:
+        raise ConfigError(
+            f"{place}: [control] {', '.join(said)} are no settings any more; no control.variant has all these values"
+        )
+    control.setdefault("variant", found)
+
+
+def _gather_phases(training: dict[str, Any]) -> None:
+    """Make `phases` of the shares of a run that were settings of their own."""
+    said = {name: training.pop(name) for name in PHASES if name in training}
+    if said:
+        *borders, averaged = {**PHASES, **said}.values()
+        training.setdefault("phases", [*borders, 1.0 - averaged])

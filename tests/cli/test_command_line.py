@@ -152,7 +152,7 @@ DEMO = ["demo-scene", "scene"]
         ([*TRAIN, "--method", "nerf"], "--method nerf: expected one of compgs, 3dgs"),
         ([*TRAIN, "--method", "3dgs", "--lmbda", "0"], "--lmbda: not a setting of --method 3dgs"),
         ([*TRAIN, "--set", "training.steps=abc"], "--set training.steps=abc: expected a whole number"),
-        ([*TRAIN, "--set", "training.rate_start=2"], "--set training.rate_start=2.0: expected 0 to 1"),
+        ([*TRAIN, "--set", "training.ssim_weight=2"], "--set training.ssim_weight=2.0: expected 0 to 1"),
         ([*TRAIN, "--set", "training.stepz=1"], "--set training.stepz=1: there is no setting 'stepz'"),
         ([*TRAIN, "--set", "steps"], "--set steps: expected section.key=value"),
         ([*TRAIN, "--stpes", "3"], "--stpes: compgs train has no use for it (did you mean --steps?)"),

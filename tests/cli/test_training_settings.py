@@ -40,8 +40,8 @@ def train(*arguments: object) -> Train:
         ("training.steps=5_000", "training", "steps", 5000),
         ("training.lmbda=5e-3", "training", "lmbda", 0.005),
         ("training.rate=elements", "training", "rate", "elements"),
-        ("training.color_lr=0.01,1e-4", "training", "color_lr", (0.01, 1e-4)),
-        ("training.color_lr=[0.01, 1e-4]", "training", "color_lr", (0.01, 1e-4)),
+        ("training.embedding_lr=0.01,1e-4", "training", "embedding_lr", (0.01, 1e-4)),
+        ("training.embedding_lr=[0.01, 1e-4]", "training", "embedding_lr", (0.01, 1e-4)),
         ("model.voxel_size=none", "model", "voxel_size", None),
         ("model.voxel_size=0.02", "model", "voxel_size", 0.02),
         ("model.heads=separate", "model", "heads", "separate"),
@@ -65,8 +65,8 @@ def test_a_setting_is_read_by_its_type(assignment: str, section: str, key: str, 
         ("training.lmbda=a lot", "a number"),
         ("training.lmbda=nan", "--lmbda nan: expected 0 to 100"),
         ("training.rate=bytes", "one of bits, elements"),
-        ("training.color_lr=0.1", "2 numbers"),
-        ("training.color_lr=0.1,x", "a number"),
+        ("training.embedding_lr=0.1", "2 numbers"),
+        ("training.embedding_lr=0.1,x", "a number"),
         ("trainings.steps=1", "model, entropy, control, training"),
         ("training.step=1", "steps"),
         ("model.coupled_primitives=0", "1 to 64"),
@@ -198,7 +198,7 @@ def test_damaged_run_settings_are_refused_by_name(tmp_path: Path, content: str) 
 
 
 def test_settings_survive_the_file(tmp_path: Path) -> None:
-    config = with_settings(load_config("paper"), ["training.color_lr=0.01,1e-4", "model.voxel_size=0.5"])
+    config = with_settings(load_config("paper"), ["training.embedding_lr=0.01,1e-4", "model.voxel_size=0.5"])
     settings = RunSettings("paper", SceneSource("a folder/ü", 4, "images", 8, True, None), config)
     save_settings(tmp_path, settings)
     assert load_settings(tmp_path) == settings

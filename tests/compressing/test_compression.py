@@ -203,7 +203,7 @@ def test_a_time_is_kept_and_its_steps_are_written_down(
 
 def test_a_trial_has_the_rate_in_every_step_and_nothing_else(config: Config) -> None:
     trial = pace.trial(default_config())
-    assert trial.training.rate_start == 0 and trial.training.target_bytes is None
+    assert trial.training.borders.rate == 0 and trial.training.target_bytes is None
     assert trial.control.prune_at == () and trial.entropy.decorrelate_at == ()
 
 

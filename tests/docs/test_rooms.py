@@ -22,6 +22,9 @@ TABLED = (
     "training/rate",
     "training/run",
     "training/splats",
+    "published",
+    "published/parts",
+    "methods/parts",
 )
 
 

@@ -18,7 +18,7 @@ from compgs.training.splats.trainer import train_splats
 from compgs.formats.ply import write_ply
 
 scene = compgs.load_scene(sys.argv[1])
-steps = ("training.steps=60", "training.rate_start=0.2", "control.start=0.2", "control.minimum_views=2")
+steps = ("training.steps=60", "training.phases=0.05,0.2,0.8,0.8,0.9", "control.start=0.2", "control.minimum_views=2")
 model = compgs.train(scene, with_settings(load_config("quick"), steps))
 # Not the file: coding it takes other kernels, of integers, which have one result however they are compiled.
 Path(sys.argv[2] + ".model").write_bytes(b"".join(x.numpy().tobytes() for x in model.state_dict().values()))

@@ -26,7 +26,6 @@ OPTIONS = [
     "--seed",
     "7",
     "--set",
-    "training.checkpoint_minutes=1e5",
 ]
 
 

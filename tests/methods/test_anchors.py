@@ -119,7 +119,7 @@ def test_plain_anchors_learn_and_grow(blob_scene: Scene, config: Config) -> None
     config = replace(config, control=control, training=replace(config.training, steps=120))
     trainer = AnchorTrainer(blob_scene, config, torch.device("cpu"), "toy")
     before, losses = trainer.model.anchors, []
-    trainer.run(Run("toy", on_progress=lambda status: losses.append(status.loss), device="cpu"))
+    trainer.carry_out(Run("toy", on_progress=lambda status: losses.append(status.loss), device="cpu"))
     assert trainer.model.anchors > before
     assert np.mean(losses[-3:]) < 0.5 * np.mean(losses[:2])
     assert trainer.estimated_bytes() == 4 * sum(p.numel() for p in trainer.model.parameters())

@@ -14,12 +14,12 @@ from compgs.errors import CompGSError, NotEncodable, SplatFileError
 from compgs.exporting import export
 from compgs.formats import packed
 from compgs.methods import METHODS, settings_of, train, write
-from compgs.methods.cosa import reader
 from compgs.methods.cosa.model import CosaModel
 from compgs.methods.cosa.settings import CosaConfig
 from compgs.methods.cosa.trainer import BITS_PER_MEGABYTE, CosaTrainer
 from compgs.methods.cosa.writer import packed_content
 from compgs.opening import component_bytes, open_scene
+from compgs.published.cosa import reader
 from compgs.published.cosa.chain import coordinate_inputs
 from compgs.published.cosa.shape import GROUPS
 from compgs.render import render

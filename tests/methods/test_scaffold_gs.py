@@ -22,7 +22,7 @@ GROWTH: dict[str, Any] = {
     "gradient_threshold": 1e-6,
     "minimum_views": 1,
 }
-GROWTH["finer_needs_coarser"] = False  # the blobs leave no coarse cell empty
+GROWTH["variant"] = "default"  # the blobs leave no coarse cell empty
 
 
 def quick(steps: int = 40, **control: Any) -> Any:

@@ -129,7 +129,7 @@ def test_a_finished_run_trains_nothing_again(city: Path, tmp_path: Path, runs: I
     shutil.copytree(city, copy)  # also where it has moved
     before = {path: path.stat().st_mtime_ns for path in copy.glob("blocks/*/*.cgs")}
     manifest = (copy / "city.tiles" / "manifest.json").read_bytes()
-    assert main(["train", "-o", str(copy), "--resume", "--threads", "1"]) == 0
+    assert main(["tiles", "-o", str(copy), "--resume", "--threads", "1"]) == 0
     assert runs.calls == []
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert (copy / "city.tiles" / "manifest.json").read_bytes() == manifest

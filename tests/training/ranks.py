@@ -18,7 +18,7 @@ import torch.distributed as dist
 import compgs  # before torch: its threads must not spin
 
 sys.path.append(str(Path(__file__).parents[1]))
-from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig
+from compgs.config import Config, ControlConfig, ModelConfig, Phases, TrainingConfig
 from compgs.errors import CompGSError
 from compgs.scene.generated import generate_scene
 from compgs.scene.views import Scene, View
@@ -42,7 +42,7 @@ CONFIG = Config(
         views_per_step=2,
         exposure=True,
         rules="all but sampled_gradients",
-        rate_start=0.0,
+        phases=Phases(rate=0.0),
     ),
 )
 TRAINERS: dict[str, Callable[..., Any]] = {"compgs": Trainer, "3dgs": SplatTrainer}

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from compgs.config import Config
+from compgs.config import Config, Phases
 from compgs.scene.views import Scene
 from compgs.training.structure.averaging import Averaging
 from compgs.training.trainer import Trainer
@@ -32,7 +32,7 @@ def steps_of(trainer: Trainer, steps: int) -> list[dict[str, torch.Tensor]]:
 
 
 def test_a_run_ends_with_the_mean_of_its_last_steps(blob_scene: Scene, tiny_config: Config) -> None:
-    trainer = Trainer(blob_scene, settings(tiny_config, averaged=0.2), CPU)
+    trainer = Trainer(blob_scene, settings(tiny_config, phases=Phases(mean=0.8)), CPU)
     every = steps_of(trainer, tiny_config.training.steps)
     trainer.finish()
     last = every[-round(0.2 * tiny_config.training.steps) :]
@@ -47,7 +47,7 @@ def test_a_run_ends_with_the_mean_of_its_last_steps(blob_scene: Scene, tiny_conf
 def test_without_averaging_a_run_ends_where_its_last_step_went(
     blob_scene: Scene, tiny_config: Config
 ) -> None:
-    trainer = Trainer(blob_scene, settings(tiny_config, averaged=0.0), CPU)
+    trainer = Trainer(blob_scene, settings(tiny_config, phases=Phases(mean=1)), CPU)
     last = steps_of(trainer, tiny_config.training.steps)[-1]
     trainer.finish()
     assert all(torch.equal(value, last[name]) for name, value in parameters(trainer).items())
@@ -56,7 +56,7 @@ def test_without_averaging_a_run_ends_where_its_last_step_went(
 def test_the_mean_begins_anew_after_whatever_else_changes_the_model(
     blob_scene: Scene, tiny_config: Config
 ) -> None:
-    late = settings(tiny_config, averaged=0.5)
+    late = settings(tiny_config, phases=Phases(mean=0.5))
     late = replace(late, entropy=replace(late.entropy, decorrelate_at=(0.8,)))
     trainer = Trainer(blob_scene, late, CPU)
     every = steps_of(trainer, late.training.steps)
@@ -70,14 +70,14 @@ def test_the_mean_begins_anew_after_whatever_else_changes_the_model(
 def test_a_run_that_was_stopped_among_its_last_steps_ends_with_the_same_mean(
     blob_scene: Scene, tiny_config: Config, tmp_path: Path
 ) -> None:
-    config = settings(tiny_config, averaged=0.3)
+    config = settings(tiny_config, phases=Phases(mean=0.7))
     whole = Trainer(blob_scene, config, CPU)
     whole.run(None, None)
     first = Trainer(blob_scene, config, CPU)
     steps_of(first, config.training.steps - 5)
     first.save(tmp_path / "checkpoint")
     second = Trainer.resumed(blob_scene, tmp_path / "checkpoint", config, CPU)
-    assert second.average.steps == first.average.steps == 7
+    assert second.structure.average.steps == first.structure.average.steps == 7
     second.run(None, None)
     for name, value in parameters(whole).items():
         assert torch.equal(value, parameters(second)[name]), name

@@ -11,10 +11,10 @@ from compgs.interrupt import Terminated, ended_on_request, held_back
 from compgs.training.run import checkpoint as checkpoint_module
 from compgs.training.run.checkpoint import (
     Writer,
-    load_checkpoint,
     read_checkpoint_file,
     write_checkpoint_file,
 )
+from compgs.training.run.model_checkpoint import load_checkpoint
 from compgs.training.run.pace import Pace
 from compgs.training.trainer import Trainer
 
@@ -171,7 +171,8 @@ def test_a_run_that_is_stopped_at_once_leaves_the_checkpoint_of_an_earlier_run(
 def test_after_its_first_checkpoint_a_run_keeps_its_own(blob_scene, tiny_config, tmp_path, monkeypatch):
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(b"of an earlier run")
-    config = replace(tiny_config, training=replace(tiny_config.training, checkpoint_minutes=1e-9))
+    config = tiny_config
+    monkeypatch.setattr("compgs.training.run.saving.MINUTES", 1e-9)
     found = {}
 
     def look(status):
@@ -275,7 +276,8 @@ def test_what_hinders_a_checkpoint_beside_the_steps_is_raised_by_the_run(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(checkpoint_module.safetensors.torch, "save_file", full)
-    config = replace(tiny_config, training=replace(tiny_config.training, checkpoint_minutes=1e-9))
+    config = tiny_config
+    monkeypatch.setattr("compgs.training.run.saving.MINUTES", 1e-9)
     trainer = Trainer(blob_scene, config, CPU)
     with pytest.raises(OutputError, match="No space left"):
         trainer.run(tmp_path / "run.safetensors", None)

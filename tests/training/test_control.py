@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from compgs.cameras import Camera
-from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig, load_config
+from compgs.config import Config, ControlConfig, ModelConfig, Phases, TrainingConfig, load_config
 from compgs.gaussians import Gaussians
 from compgs.tensors.prediction import Prediction
 from compgs.trained_model import TrainedModel
@@ -257,7 +257,9 @@ def test_a_run_grows_by_the_lambda_that_it_has_come_to(blob_scene, tiny_config):
 
 def test_a_size_is_followed_gently_before_statistics_are_gathered(blob_scene, tiny_config, monkeypatch):
     """Anchors are still to come then: `grown` is false."""
-    config = replace(tiny_config, training=replace(tiny_config.training, target_bytes=10**6, rate_start=0.0))
+    config = replace(
+        tiny_config, training=replace(tiny_config.training, target_bytes=10**6, phases=Phases(rate=0.0))
+    )
     trainer = Trainer(blob_scene, config, CPU)
     trainer.structure.target_size.schedule = ControlSchedule(start=20, stop=30, every=8, observe=15)
     asked = []
@@ -348,7 +350,7 @@ def test_a_view_adds_its_gradients_sightings_and_opacities_to_the_right_primitiv
 
 
 def test_each_grid_grows_from_the_primitives_that_pass_its_threshold():
-    """lambda 0.008 is four times the usual one, so the threshold is twice as large: 2, 4 and 8."""
+    """lambda 0.016 is eight times the usual one, so the threshold is twice as large: 2, 4 and 8."""
     model = made_model(
         [[0, 0, 0], [400, 0, 0], [0, 400, 0]],
         [[1.0, 5.0, 2.0], [3.0, 4.0, -2.0], [9.0, 9.0, 9.0]],
@@ -361,7 +363,7 @@ def test_each_grid_grows_from_the_primitives_that_pass_its_threshold():
         [[101, 102, 98], [301, 302, 303]],  # 4.1: grids of 16 (with the one above) and 4; 8.1: all three
         [[700, 700, 700], [-90, -70, 0]],  # not judged; 3.9: grid of 16
     ]
-    act(control, model, torch.tensor(voxels) * VOXEL, lmbda=0.008)
+    act(control, model, torch.tensor(voxels) * VOXEL, lmbda=0.016)
     assert grown_rows(model, 3) == [
         ([-96, -64, 0], [9.0, 9.0, 9.0], 16.0),
         ([96, 96, 96], [3.0, 5.0, 2.0], 16.0),  # the largest of either parent
@@ -406,7 +408,7 @@ FAR = [[203, 0, 0], [203, 0, 0]]
 )
 def test_finer_grids_wait_for_a_coarser_one_that_has_grown(preset, gradients, expected):
     """As published; in the default preset they do not."""
-    config = replace(CERTAIN, finer_needs_coarser=preset.finer_needs_coarser)
+    config = replace(CERTAIN, variant=preset.variant)
     model = made_model([[0, 0, 0], [400, 0, 0]], [[0.0] * 3] * 2, config)
     act(with_gradients(model, gradients), model, torch.tensor([NEAR, FAR]) * VOXEL)
     assert [(voxel, size) for voxel, _, size in grown_rows(model, 2)] == expected
@@ -414,7 +416,7 @@ def test_finer_grids_wait_for_a_coarser_one_that_has_grown(preset, gradients, ex
 
 def test_the_finest_grid_grows_after_the_coarsest_where_the_one_between_has_not():
     """A primitive at voxel 1: its cells of 16 and 4 are the anchor's, that of 1 is free."""
-    model = made_model([[0, 0, 0], [400, 0, 0]], [[0.0] * 3] * 2, replace(CERTAIN, finer_needs_coarser=True))
+    model = made_model([[0, 0, 0], [400, 0, 0]], [[0.0] * 3] * 2, replace(CERTAIN, variant="published"))
     control = with_gradients(model, [[100.0, 0.0], [1.5, 0.0]])
     act(control, model, torch.tensor([[[1, 0, 0]] * K, FAR]) * VOXEL)
     assert [(v, size) for v, _, size in grown_rows(model, 2)] == [([208, 0, 0], 16.0), ([1, 0, 0], 1.0)]
@@ -466,7 +468,7 @@ def test_what_was_judged_is_counted_anew_and_the_rest_goes_on():
 
 
 def test_as_published_everything_is_counted_anew():
-    control, model = filled(replace(CERTAIN, reset_all=PAPER.reset_all))
+    control, model = filled(replace(CERTAIN, variant=PAPER.variant))
     act(control, model, torch.zeros(2, K, 3))
     assert model.anchors == 2
     assert not any(getattr(control, name).any() for name in control.STATISTICS)

@@ -73,7 +73,7 @@ def test_nothing_that_a_decoder_draws_is_left_out(trained):
     for view in trained.scene.train_views:
         drawn = visible_mask(centers, radii, view.camera, trained.settings)
         looked_at = torch.zeros_like(drawn)
-        looked_at[trained.visible_anchors(view.camera)] = True
+        looked_at[trained.survey.visible_anchors(view.camera)] = True
         assert drawn.any() and looked_at[drawn].all()
 
 
@@ -81,8 +81,8 @@ def test_an_anchor_far_outside_whose_primitives_reach_into_the_view_is_looked_at
     camera = trained.scene.train_views[0].camera
     with torch.no_grad():
         trained.model.heads.geometry.output_bias[:3] += 4.0  # reaches
-    trained.bounds.forget()
-    rows = trained.visible_anchors(camera)
+    trained.survey.bounds.forget()
+    rows = trained.survey.visible_anchors(camera)
     everything = torch.arange(trained.model.anchors)
     images = []
     for chosen in (rows, everything):
@@ -93,10 +93,10 @@ def test_an_anchor_far_outside_whose_primitives_reach_into_the_view_is_looked_at
 
 
 def test_what_was_measured_goes_on_with_a_run(trained, blob_scene, tiny_config, tmp_path):
-    trained.visible_anchors(blob_scene.train_views[0].camera)
+    trained.survey.visible_anchors(blob_scene.train_views[0].camera)
     trained.save(tmp_path / "a")
     again = Trainer.resumed(blob_scene, tmp_path / "a", tiny_config, CPU)
-    assert torch.equal(again.bounds.measured, trained.bounds.measured)
+    assert torch.equal(again.survey.bounds.measured, trained.survey.bounds.measured)
     with torch.no_grad():
         again.model.log_scales.add_(1.0)
-    assert torch.allclose(again.bounds.radii(), torch.e * trained.bounds.radii())
+    assert torch.allclose(again.survey.bounds.radii(), torch.e * trained.survey.bounds.radii())

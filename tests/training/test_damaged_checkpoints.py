@@ -12,6 +12,7 @@ import safetensors
 import safetensors.torch
 import torch
 
+from compgs.config import Phases
 from compgs.errors import CheckpointError
 from compgs.training.run.model_checkpoint import load_checkpoint
 from compgs.training.splats.trainer import SplatTrainer
@@ -29,7 +30,7 @@ def written(tmp_path_factory: pytest.TempPathFactory, blob_scene) -> dict[str, t
     folder = tmp_path_factory.mktemp("checkpoints")
     config = Config(
         model=ModelConfig(coupled_primitives=4, reference_dim=8, residuals=True, width=16, voxel_size=0.1),
-        training=TrainingConfig(steps=40, seed=3, exposure=True, averaged=1.0),
+        training=TrainingConfig(steps=40, seed=3, exposure=True, phases=Phases(mean=0.0)),
     )
     result = {}
     for name, kind in KINDS.items():

@@ -215,7 +215,7 @@ def test_each_channel_moves_as_far_as_its_rate_says(blob_scene: Scene, tiny_conf
     assert torch.equal(plain.model.references, other.model.references)
     before = plain.model.references.detach().clone()
     rates = torch.linspace(0.0, 3.5, before.shape[1])
-    other.channel_rates.values = rates
+    other.structure.channel_rates.values = rates
     plain.train_step()
     other.train_step()
     moved = plain.model.references.detach() - before

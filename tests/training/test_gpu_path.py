@@ -12,7 +12,7 @@ from compgs.gaussians import Gaussians
 from compgs.render.settings import DEFAULT_SETTINGS
 from compgs.tensors import gsplat_backend, where
 from compgs.tensors.reference import Splats, composite, project
-from compgs.training.trainer import train
+from compgs.training.hybrid import train
 
 from .rules import without
 

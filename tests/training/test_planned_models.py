@@ -9,8 +9,9 @@ import torch
 from compgs.codec import decode, encode
 from compgs.config import Config
 from compgs.scene.views import Scene
+from compgs.training.hybrid import train
 from compgs.training.run.model_checkpoint import load_checkpoint
-from compgs.training.trainer import Trainer, train
+from compgs.training.trainer import Trainer
 
 
 def test_a_run_with_twice_as_many_primitives_resumes_and_encodes_as_if_it_had_not_stopped(

@@ -72,7 +72,7 @@ def test_bits_are_settled_once_the_networks_compute_with_them(blob_scene: Scene,
     trainer.rate = replace(trainer.rate, lmbda=1.0)
     trainer.structure.follow(trainer.step, trainer.rate, stored=trainer.now.stored)
     assert trainer.model.head_bits == 5
-    trainer.step = int(priced.training.quantized_weights * priced.training.steps)
+    trainer.step = int(priced.training.borders.weights * priced.training.steps)
     trainer.rate = replace(trainer.rate, lmbda=1e-9)
     trainer.structure.follow(trainer.step, trainer.rate, stored=trainer.now.stored)
     assert trainer.model.head_bits == 5

@@ -114,7 +114,7 @@ def test_squared_changes_are_those_of_images_without_an_anchor(unequal: Trainer)
     draws = [
         squared_changes(
             [(number, views[0].camera), (number + 1000, views[1].camera)],
-            unequal.survey.predicted, unequal.shape, unequal.settings, CPU,
+            unequal.survey.predicted, unequal.survey.shape, unequal.settings, CPU,
         )[0].numpy()
         for number in range(96)
     ]  # fmt: skip
@@ -128,7 +128,9 @@ def test_squared_changes_are_those_of_images_without_an_anchor(unequal: Trainer)
 def test_changes_are_a_mean_over_the_values_of_all_views(unequal: Trainer) -> None:
     views = unequal.scene.train_views
     numbered = [(unequal.step * len(views) + i, view.camera) for i, view in enumerate(views)]
-    total, _ = squared_changes(numbered, unequal.survey.predicted, unequal.shape, unequal.settings, CPU)
+    total, _ = squared_changes(
+        numbered, unequal.survey.predicted, unequal.survey.shape, unequal.settings, CPU
+    )
     values = sum(view.image.size for view in views)
     assert torch.equal(unequal.survey.changes(256), total / values)
 
@@ -141,7 +143,7 @@ def test_what_only_views_see_that_are_not_asked_outlasts_a_pruning(unequal: Trai
     unequal.scene = replace(unequal.scene, train_views=(asked, unequal.scene.train_views[1]))
     unequal.survey.scene = unequal.scene
     hidden = np.ones(unequal.model.anchors, bool)
-    hidden[unequal.visible_anchors(away).numpy()] = False
+    hidden[unequal.survey.visible_anchors(away).numpy()] = False
     assert hidden.any()
     assert (np.isinf(unequal.survey.changes(1).numpy()) == hidden).all()
     bits = torch.ones(unequal.model.anchors)
@@ -166,7 +168,7 @@ def test_large_views_are_judged_with_sides_halved(unequal: Trainer) -> None:
         np.mean(
             [
                 squared_changes(
-                    [(number, c)], unequal.survey.predicted, unequal.shape, unequal.settings, CPU
+                    [(number, c)], unequal.survey.predicted, unequal.survey.shape, unequal.settings, CPU
                 )[0].numpy()
                 for number in range(64)
             ],
@@ -273,7 +275,7 @@ def test_several_prunings_take_as_one_at_a_higher_price_but_each_at_most_half(
 
 def test_pruning_takes_what_does_not_pay_by_the_bits_of_the_file(unequal: Trainer) -> None:
     model = unequal.model
-    unequal.config = with_pruning(unequal.config, 20.0, ())
+    unequal.structure.config = with_pruning(unequal.config, 20.0, ())
     changes = unequal.survey.changes(256).numpy()
     streams = model.quantized(rate=True).bits.values()
     bits = sum(stream.detach().double().numpy() for stream in streams) + 10
@@ -287,14 +289,16 @@ def test_pruning_takes_what_does_not_pay_by_the_bits_of_the_file(unequal: Traine
     assert 0.7 * (changes > 0).sum() < kept.sum() < 0.85 * (changes > 0).sum()
     coordinates, references = model.coordinates[kept], model.references.detach()[kept]
     unequal.rate = RateState(lmbda)
-    unequal.prune()
+    unequal.structure.prune(unequal.step, unequal.rate)
     assert torch.equal(model.coordinates, coordinates)
     assert torch.equal(model.references.detach(), references)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.3])
 def test_the_file_gets_the_primitives_that_the_views_would_miss(unequal: Trainer, share: float) -> None:
-    unequal.config = replace(unequal.config, control=replace(unequal.config.control, idle_share=share))
+    unequal.structure.config = replace(
+        unequal.config, control=replace(unequal.config.control, idle_share=share)
+    )
     everything = unequal.survey.contributions().numpy()
     kept = least_first(everything.reshape(-1), share).reshape(everything.shape)
     assert kept.any() and not kept[::9].any()
@@ -321,7 +325,7 @@ def test_what_no_view_misses_can_go_without_a_change(unequal: Trainer) -> None:
     anchors = unequal.model.anchors
     views = unequal.scene.train_views[:3]
     before = [render(unequal.model.as_hybrid_model(), view.camera).image for view in views]
-    unequal.prune()
+    unequal.structure.prune(unequal.step, unequal.rate)
     assert unequal.model.anchors <= anchors - len(range(0, anchors, 9))
     for view, old in zip(views, before, strict=True):
         new = render(unequal.model.as_hybrid_model(), view.camera).image

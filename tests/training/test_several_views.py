@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from compgs.config import Config, ControlConfig, SplatConfig
+from compgs.config import Config, ControlConfig, Phases, SplatConfig
 from compgs.errors import ConfigError
 from compgs.scene.views import Scene
 from compgs.training.splats.densification import densify_schedule
@@ -23,8 +23,7 @@ CPU = torch.device("cpu")
 CERTAIN = {
     "steps": 20,
     "rules": without(SIZES_AS_SET, "dropout", "sampled_gradients"),
-    "hard_rate": 0.0,
-    "rate_start": 0.0,
+    "phases": Phases(rate=0.0, symbols=0.0),
 }
 
 
@@ -159,7 +158,7 @@ def test_moments_of_independent_gradients_move_as_far_in_fewer_steps() -> None:
 
 
 def test_a_pass_takes_fewer_steps_of_more_views() -> None:
-    passes = ControlConfig(start=1.0, every=1.0, start_passes=5, every_passes=2, observe_passes=3)
+    passes = ControlConfig(start=1.0, every=1.0, variant="published")
     one, four = make_schedule(passes, 30_000, 200), make_schedule(passes, 30_000, 200, 4)
     assert (one.start, one.every, one.observe) == (999, 400, 600)
     assert (four.start, four.every, four.observe) == (249, 100, 150)

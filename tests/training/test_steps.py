@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from compgs.config import Config
+from compgs.config import Config, Phases
 from compgs.render import render
 from compgs.scene.views import Scene, View
 from compgs.tensors.ssim import ssim
@@ -23,8 +23,7 @@ STEPS = 20
 CERTAIN = {
     "steps": STEPS,
     "rules": without(SIZES_AS_SET, "dropout", "sampled_gradients", "rate_every"),
-    "hard_rate": 0.0,
-    "rate_start": 0.0,
+    "phases": Phases(rate=0.0, symbols=0.0),
 }
 
 
@@ -71,7 +70,7 @@ def parts_of_loss(trainer: Trainer, view: View) -> tuple[float, float, float, di
         {"scale_weight": 2e4},
         {"lmbda": 0.5},
         {"lmbda": 0.5, "rate": "elements"},
-        {"lmbda": 0.5, "rate_start": 0.1},
+        {"lmbda": 0.5, "phases": Phases(symbols=0.0)},
     ],
     ids=str,
 )
@@ -90,7 +89,7 @@ def test_the_loss_of_a_step_is_its_formula(
     else:
         rate = 5 / 132 * sum(bits.values())
     distortion = (1 - t.ssim_weight) * l1 + t.ssim_weight * (1 - similarity) + t.scale_weight * volume
-    counted = t.lmbda * rate if t.rate_start == 0 else 0.0
+    counted = t.lmbda * rate if t.borders.rate == 0 else 0.0
     assert float(trainer.train_step().loss) == pytest.approx(distortion + counted, rel=1e-3)
     if "scale_weight" in settings:
         assert t.scale_weight * volume > 0.1 * distortion
@@ -101,7 +100,9 @@ def test_the_loss_of_a_step_is_its_formula(
 def test_the_rate_joins_the_loss_and_symbols_take_the_place_of_noise_at_their_shares_of_the_run(
     blob_scene: Scene, tiny_config: Config
 ) -> None:
-    config = with_training(tiny_config, **{**CERTAIN, "rate_start": 0.25, "hard_rate": 0.5, "lmbda": 10.0})
+    config = with_training(
+        tiny_config, **{**CERTAIN, "phases": Phases(rate=0.25, symbols=0.5), "lmbda": 10.0}
+    )
     found = {}
     for step in (4, 5, 9, 10):
         trainer = started(blob_scene, config, step)
@@ -130,9 +131,9 @@ def test_lambda_that_follows_a_size_is_the_one_that_weighs(blob_scene: Scene, ti
 def test_learning_rates_are_those_of_the_settings_at_this_step(
     blob_scene: Scene, tiny_config: Config, schedule: str, step: int, warm_up: float
 ) -> None:
-    config = with_training(
-        tiny_config, **CERTAIN, schedule=schedule, head_warm_up=warm_up, entropy_lr_steps=2 * STEPS
-    )
+    phases = CERTAIN["phases"]._replace(warm=warm_up)
+    changes = {"schedule": schedule, "phases": phases, "entropy_lr_steps": 2 * STEPS, "head_lr": 0.5}
+    config = with_training(tiny_config, **{**CERTAIN, **changes})
     t, progress = config.training, step / STEPS
     trainer = started(blob_scene, config, step)
     trainer.train_step()
@@ -142,8 +143,8 @@ def test_learning_rates_are_those_of_the_settings_at_this_step(
         "references": (t.embedding_lr, 1.0),
         "residuals": (t.embedding_lr, 1.0),
         "entropy": (tuple(2 * rate for rate in t.entropy_lr), 1.0),
-        "geometry": (t.covariance_lr, rising),
-        "appearance": (t.color_lr, rising),
+        "geometry": ((2e-3, 2e-5), rising),
+        "appearance": ((4e-3, 4e-5), rising),
     }
     assert {group["name"] for group in trainer.optimizer.param_groups} == set(of_group)
     for group in trainer.optimizer.param_groups:
@@ -180,7 +181,7 @@ def test_adam_moves_anchors_out_of_view_on(blob_scene: Scene, tiny_config: Confi
 def test_in_the_last_steps_the_image_is_that_of_the_weights_as_they_will_be_stored(
     blob_scene: Scene, tiny_config: Config
 ) -> None:
-    config = with_training(tiny_config, **CERTAIN, quantized_weights=0.5)
+    config = with_training(tiny_config, **{**CERTAIN, "phases": CERTAIN["phases"]._replace(weights=0.5)})
     config = replace(config, entropy=replace(config.entropy, head_bits=6))
     for step, stored in ((9, False), (10, True)):
         trainer = started(blob_scene, config, step)

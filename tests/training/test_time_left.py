@@ -85,7 +85,7 @@ def test_steps_of_one_size_are_not_drawn_beforehand() -> None:
 
 def test_a_pace_is_forgotten_when_pictures_become_larger(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr("compgs.training.run.loop.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("compgs.training.run.pace.time.perf_counter", lambda: now[0])
     pace = Pace()
     pace.step()
     for size, each in (((10, 10), 1.0), ((10, 10), 1.0), ((20, 20), 8.0)):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from compgs.config import Phases
 from compgs.entropy import EntropyModel
 from compgs.errors import ConfigError, TrainingError
 from compgs.gaussians import Gaussians
@@ -164,8 +165,8 @@ def test_no_training_views_is_a_settings_error(blob_scene, tiny_config):
 
 def test_without_a_rate_term_only_the_statistics_learn_from_the_rate(blob_scene, tiny_config):
     """Latents go the same way whether the rate is counted or not; the entropy networks do not stand still."""
-    config = replace(tiny_config, training=replace(tiny_config.training, steps=40, lmbda=0.0, rate_start=0.1))
-    never = replace(config, training=replace(config.training, rate_start=1.0))
+    config = replace(tiny_config, training=replace(tiny_config.training, steps=40, lmbda=0.0))
+    never = replace(config, training=replace(config.training, phases=Phases(rate=1.0)))
     counted, not_counted = Trainer(blob_scene, config, CPU), Trainer(blob_scene, never, CPU)
     for trainer in (counted, not_counted):
         trainer.noise = torch.zeros_like  # drawing noise would change the order of the views

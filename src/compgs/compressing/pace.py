@@ -68,11 +68,10 @@ def seconds_per_step(
 
 def trial(config: Config) -> Config:
     """The first steps of a run with nothing in them that is not in every step, but with the rate."""
+    phases = config.training.borders._replace(rate=0.0, weights=0.0)
     return replace(
         config,
-        training=replace(
-            config.training, steps=TRIED, rate_start=0.0, target_bytes=None, quantized_weights=0.0
-        ),
+        training=replace(config.training, steps=TRIED, phases=phases, target_bytes=None),
         control=replace(config.control, start=1.0, stop=0.0, prune_at=()),
         entropy=replace(config.entropy, decorrelate_at=()),
     )

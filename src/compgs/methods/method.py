@@ -20,7 +20,6 @@ SPLAT_SETTINGS = (
     "training.seed",
     "training.ssim_weight",
     "training.exposure",
-    "training.checkpoint_minutes",
 )
 # Of files in the shared container: `compgs.formats.packed.SUFFIX`, without loading the formats.
 PACKED_SUFFIX = ".packed"

@@ -57,5 +57,5 @@ def neighbours_of(number: int, cameras: Sequence[Camera], sights: Sequence[Sight
 
 
 def asked_of(points: np.ndarray) -> np.ndarray:
-    """At most `ASKED` of points [P, 3], evenly spread over their order."""
+    """Choose at most `ASKED` of points [P, 3], evenly spread over their order."""
     return points[:: max(1, math.ceil(len(points) / ASKED))].astype(np.float64)

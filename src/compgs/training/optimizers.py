@@ -18,7 +18,15 @@ from torch import Tensor, nn
 from compgs.config import TrainingConfig
 from compgs.trained_model import TrainedModel
 
-HEAD_GROUPS = ("geometry", "appearance", "translation", "covariance", "opacity", "color")
+# First and last learning rate of the prediction heads, by the names of their networks (Ref.).
+HEAD_RATES = {
+    "geometry": (4e-3, 4e-5),
+    "appearance": (8e-3, 8e-5),
+    "translation": (2e-3, 2e-5),
+    "covariance": (4e-3, 4e-5),
+    "opacity": (2e-3, 2e-5),
+    "color": (8e-3, 8e-5),
+}
 ADAM_EPSILON = 1e-15  # gradients of single primitives are tiny (3DGS)
 BETAS = (0.9, 0.999)  # Adam's, for one view a step
 
@@ -40,15 +48,9 @@ def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.A
         group("residuals", [model.residuals], config.embedding_lr),
         group("entropy", entropy.parameters(), entropy_lr),
     ]
-    head_rates = {
-        "geometry": config.covariance_lr,
-        "appearance": config.color_lr,
-        "translation": config.translation_lr,
-        "covariance": config.covariance_lr,
-        "opacity": config.opacity_lr,
-        "color": config.color_lr,
-    }
-    groups += [group(name, network.parameters(), head_rates[name]) for name, network in heads.networks()]
+    for name, network in heads.networks():
+        first, last = HEAD_RATES[name]
+        groups.append(group(name, network.parameters(), (config.head_lr * first, config.head_lr * last)))
     return torch.optim.Adam(groups, lr=1e-3, eps=ADAM_EPSILON, fused=True)
 
 
@@ -83,7 +85,7 @@ def set_learning_rates(
     for group in optimizer.param_groups:
         first, last = group["rates"]
         group["lr"] = decay(first, last, progress)
-        if group["name"] in HEAD_GROUPS:
+        if group["name"] in HEAD_RATES:
             group["lr"] *= rising
 
 

@@ -18,25 +18,17 @@ ANCHOR_SETTINGS = (
     "control.every",
     "control.gradient_threshold",
     "control.minimum_views",
-    "control.minimum_share",
     "control.opacity_threshold",
-    "control.opacity_views",
-    "control.opacity_share",
-    "control.reset_all",
     "control.growth_probabilities",
-    "control.finer_needs_coarser",
+    "control.variant",
     "training.steps",
     "training.seed",
     "training.ssim_weight",
     "training.scale_weight",
     "training.log_scale_lr",
-    "training.covariance_lr",
-    "training.opacity_lr",
-    "training.color_lr",
     "training.schedule",
-    "training.head_warm_up",
+    "training.phases",
     "training.exposure",
-    "training.checkpoint_minutes",
 )
 
 
@@ -48,3 +40,7 @@ class AnchorSection:
     feature_lr: LearningRates = (0.0165, 1e-4)
     # of offsets, in units of the position scale (Scaffold-GS)
     offset_lr: LearningRates = (0.01, 1e-4)
+    # of the networks of scales and rotations, opacities and colors
+    covariance_lr: LearningRates = (4e-3, 4e-5)
+    opacity_lr: LearningRates = (2e-3, 2e-5)
+    color_lr: LearningRates = (8e-3, 8e-5)

@@ -87,7 +87,7 @@ class AnchorTrainer(SceneTrainer):
     def groups(self) -> dict[str, tuple[list[Tensor], tuple[float, float]]]:
         """Parameters with their first and last learning rate, by a name."""
         m, t, own = self.model, self.config.training, getattr(self.config, "anchors")  # noqa: B009
-        networks = {"opacity": t.opacity_lr, "color": t.color_lr, "covariance": t.covariance_lr}
+        networks = {"opacity": own.opacity_lr, "color": own.color_lr, "covariance": own.covariance_lr}
         return {
             "features": ([m.features], own.feature_lr),
             "offsets": ([m.offsets], own.offset_lr),

@@ -12,7 +12,7 @@ SETTINGS = (
     "cosa",
     "training.lmbda",
     "training.entropy_lr",
-    "training.quantized_weights",
+    "training.phases",
 )
 Step = Annotated[float, Range(0, 1e3, above=True, below=True)]
 
@@ -50,7 +50,7 @@ class CosaSection:
     position_bits: Annotated[float, Range(0, 63)] = 10.0
     # of the context networks' weights, so rounded as soon as there is a rate (COSA-GS)
     network_bits: Annotated[int, Range(6, 16)] = 8
-    # of the rendering networks' weights, so rounded from `training.quantized_weights` on (COSA-GS: 16, which in a small
+    # of the rendering networks' weights, so rounded from the phase `weights` on (COSA-GS: 16, which in a small
     # scene is half of the file)
     head_bits: Annotated[int, Range(6, 16)] = 7
 

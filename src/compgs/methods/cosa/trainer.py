@@ -75,7 +75,7 @@ class CosaTrainer(AnchorTrainer):
         return 0.0 if self.model.begun else super().vanishing(prediction)
 
     def weights(self) -> dict[str, Tensor]:
-        if self.progress >= self.config.training.quantized_weights:
+        if self.progress >= self.config.training.borders.weights:
             return self.model.stored_weights()
         return super().weights()
 

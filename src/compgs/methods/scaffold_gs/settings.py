@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from compgs.config import Config, ControlConfig, ModelConfig, TrainingConfig
+from compgs.config import Config, ControlConfig, ModelConfig, Phases, TrainingConfig
 from compgs.methods.anchors.settings import AnchorSection
 
 # What differs from the defaults of `compgs.config`, as in the authors' release; schedules as fractions of its 30 000
@@ -19,24 +19,24 @@ PUBLISHED: Mapping[str, Mapping[str, Any]] = {
         "gradient_threshold": 2e-4,
         "minimum_views": 41,
         "opacity_threshold": 0.005,
-        "opacity_views": 1,
-        "opacity_share": 0.8,
         "growth_probabilities": (0.5, 0.75, 0.875),
-        "finer_needs_coarser": True,
+        "variant": "scaffold-gs",
     },
     "training": {
         "schedule": "exponential",
-        "head_warm_up": 0.0,
+        "phases": Phases(warm=0.0),
+    },
+    "anchors": {
+        "feature_lr": (7.5e-3, 7.5e-3),
         "covariance_lr": (4e-3, 4e-3),
         "color_lr": (8e-3, 5e-5),
     },
-    "anchors": {"feature_lr": (7.5e-3, 7.5e-3)},
 }
 # For runs of hundreds or few thousands of steps: features that learn faster and settle, and this project's schedule.
 # In 600 steps that is 1.2 dB.
 SCALED = {
     **PUBLISHED,
-    "training": {"schedule": "cosine", "head_warm_up": 0.05},
+    "training": {"schedule": "cosine"},
     "anchors": {"feature_lr": (0.0165, 1e-4)},
 }
 

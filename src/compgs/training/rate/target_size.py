@@ -55,7 +55,7 @@ class TargetSize:
         Raises TrainingError if the latents are not finite any more.
         """
         t = self.config.training
-        if t.target_bytes is None or not due(step, t.steps, t.rate_start):
+        if t.target_bytes is None or not due(step, t.steps, t.borders.rate):
             return state
         grown = self.schedule.ended(step)
         size, fixed = self.size(), fixed_bytes(self.model)

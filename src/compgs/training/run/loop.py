@@ -33,7 +33,7 @@ def run_to_end(
     and reports."""
     if rank() > 0:
         path, on_progress, watch = None, None, None
-    saving, pace, estimate = Saving(trainer, path, config.checkpoint_minutes), Pace(), 0
+    saving, pace, estimate = Saving(trainer, path), Pace(), 0
     left = TimeLeft(trainer, config.steps, -(-config.views_per_step // world()))
     try:
         while trainer.step < config.steps:

@@ -8,6 +8,8 @@ from compgs.training.run.any_trainer import AnyTrainer
 from compgs.training.run.checkpoint import Writer
 from compgs.training.run.distributed import on_any_rank
 
+MINUTES = 5.0  # between two checkpoints; one is also written when the run is interrupted
+
 
 class Saving:
     """A run's checkpoint: written every few minutes, at the end, and when the run is stopped.
@@ -19,12 +21,12 @@ class Saving:
     checkpoint needs all of them.
     """
 
-    def __init__(self, trainer: AnyTrainer, path: Path | None, minutes: float) -> None:
+    def __init__(self, trainer: AnyTrainer, path: Path | None) -> None:
         self.trainer = trainer
         self.path = path
         self.writer = Writer()
         self.begun = False
-        self.seconds = 60 * minutes
+        self.seconds = 60 * MINUTES
         self.saved = time.perf_counter()
         (self.writes,) = on_any_rank(path is not None)
         (self.replaces,) = on_any_rank(path is not None and trainer.step == 0 and path.exists())

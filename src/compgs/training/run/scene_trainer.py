@@ -110,7 +110,7 @@ class SceneTrainer(ABC):
     def set_learning_rates(self) -> None:
         """Give each group of parameters its learning rate of this step."""
         t = self.config.training
-        set_learning_rates(self.optimizer, self.progress, DECAYS[t.schedule], t.head_warm_up)
+        set_learning_rates(self.optimizer, self.progress, DECAYS[t.schedule], t.borders.warm)
 
     def move(self) -> None:
         """Move the parameters by their gradients."""

@@ -25,13 +25,14 @@ class Moment:
 def moment(step: int, lmbda: float, training: TrainingConfig, plan: Plan, *, watched: bool) -> Moment:
     """Find what is due in a step. Once the rate has joined the loss, steps without it pass over hidden anchors."""
     progress, counted = step / training.steps, times_counted(step, plan.rate_every)
-    joined = progress >= training.rate_start
+    borders = training.borders
+    joined = progress >= borders.rate
     return Moment(
         progress=progress,
         lmbda=lmbda,
         rate_weight=counted if joined else 0,
         passes_over=joined and not counted,
-        hard=progress >= training.hard_rate,
-        stored=progress >= training.quantized_weights,
+        hard=progress >= borders.symbols,
+        stored=progress >= borders.weights,
         watched=watched,
     )

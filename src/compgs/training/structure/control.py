@@ -5,7 +5,7 @@ anchors on three grids of 16, 4 and 1 voxels; anchors whose primitives are trans
 
 The schedule is fractions of the run, so that short and long runs go through the same phases. The authors' release
 counts passes over the V training views instead: statistics from 3 V steps on, control from 5 V, every 2 V, until half
-of 30 000 steps. So passes can be given, too (`start_passes`, `every_passes`, `observe_passes`), and what comes first
+of 30 000 steps. So a variant may count passes, too (`variants.py`), and what comes first
 holds. With the `paper` preset 30 000 steps over 103 views or more go as published. A run too short for that keeps the
 fractions: seven controls, or as many as there is a whole pass for before each.
 
@@ -27,6 +27,7 @@ from compgs.config import Config, ControlConfig
 from compgs.tensors.prediction import Prediction
 from compgs.training.optimizers import AnchorRows, replace_rows
 from compgs.training.plan import growth_factor
+from compgs.training.structure.variants import VARIANTS
 
 # (gradient threshold factor, grid size in voxels), coarse first
 GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
@@ -77,12 +78,13 @@ def make_schedule(config: ControlConfig, steps: int, views: int, views_per_step:
         return round(passes * max(views, SHORTEST_PASS) / views_per_step)
 
     start, every = round(config.start * steps), round(config.every * steps)
-    if config.start_passes is not None:  # Steps count from 0: the last of n passes is step n V - 1.
-        start = min(start, pass_steps(config.start_passes) - 1)
-    if config.every_passes is not None:
-        every = min(every, pass_steps(config.every_passes))
+    variant = VARIANTS[config.variant]
+    if variant.start_passes is not None:  # Steps count from 0: the last of n passes is step n V - 1.
+        start = min(start, pass_steps(variant.start_passes) - 1)
+    if variant.every_passes is not None:
+        every = min(every, pass_steps(variant.every_passes))
     start, every = max(1, start), max(1, every, math.ceil(views / views_per_step))
-    observe = min(pass_steps(config.observe_passes), start + 1 - every)
+    observe = min(pass_steps(variant.observe_passes), start + 1 - every)
     return ControlSchedule(start, round(config.stop * steps), every, max(0, observe), views_per_step)
 
 
@@ -117,6 +119,7 @@ class AdaptiveControl:
     ) -> None:
         """`followers`: told of every change which anchors are left, [N] bool, and how many new ones follow them."""
         self.config = config
+        self.variant = VARIANTS[config.control.variant]
         self.schedule = schedule
         self.followers = followers
         anchors, k = shape
@@ -153,11 +156,11 @@ class AdaptiveControl:
     ) -> None:
         """Grow and prune. means: [N, K, 3] of all coupled primitives, world units; lmbda: the rate's present weight."""
         c, n, views = self.config.control, model.anchors, self.schedule.between
-        judged = self.drawn >= min(c.minimum_views, int(c.minimum_share * views))
+        judged = self.drawn >= min(c.minimum_views, int(self.variant.minimum_share * views))
         gradient = torch.where(judged, self.gradient / self.drawn.clamp_min(1), 0.0)
         added = self._grow(model, means, gradient, noise, lmbda)
 
-        ripe = self.seen >= max(c.opacity_views, int(c.opacity_share * views))
+        ripe = self.seen >= max(self.variant.opacity_views, int(self.variant.opacity_share * views))
         transparent = self.opacity / self.seen.clamp_min(1) < c.opacity_threshold
         kept = ~(ripe & transparent)
         if not kept.any():
@@ -171,7 +174,7 @@ class AdaptiveControl:
 
     def _start_anew(self, judged: Tensor, ripe: Tensor) -> None:
         """Zero statistics of the `judged` primitives [N, K] and the `ripe` anchors [N], bool, or of all."""
-        if self.config.control.reset_all:
+        if self.variant.reset_all:
             judged, ripe = torch.ones_like(judged), torch.ones_like(ripe)
         self.gradient[judged] = 0
         self.drawn[judged] = 0
@@ -214,7 +217,7 @@ class AdaptiveControl:
         for level, ((factor, size), probability) in enumerate(
             zip(GROWTH_LEVELS, c.growth_probabilities, strict=True)
         ):
-            if c.finer_needs_coarser and level > 0 and len(taken) == model.anchors:
+            if self.variant.finer_needs_coarser and level > 0 and len(taken) == model.anchors:
                 break
             chance = torch.rand(len(flat), generator=noise, device=flat.device)
             slots = torch.nonzero((flat >= threshold * factor) & (chance < probability) & inside).view(-1)

@@ -109,7 +109,7 @@ class Structure:
         heads' weights unless the networks compute with weights so rounded (`stored`). Returns lambda as it is now.
         """
         t = self.config.training
-        if step / t.steps > 1.0 - t.averaged:
+        if step / t.steps > t.borders.mean:
             self.average.after_step()
         self.survey.bounds.after_step(step)
         rate = self.target_size.follow(rate, step)
