@@ -77,7 +77,7 @@ def _baked(data: bytes, file: Path, device: str, bake: Bake, most: int) -> list[
 
 
 def _moved(splats: SplatArrays, offset: Sequence[float]) -> SplatArrays:
-    """From a tile's frame to that of all."""
+    """Move splats from their tile's frame to that of all."""
     shift = np.subtract(splats.world_offset, offset)
     x, y, z = offset
     return replace(splats, means=(splats.means + shift).astype(np.float32), world_offset=(x, y, z))

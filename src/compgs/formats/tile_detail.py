@@ -18,7 +18,7 @@ NEAREST = 0.1  # of a tile's size: nearer to it, or within it, it does not becom
 
 
 def levels_with_whole(tile: TileEntry) -> tuple[Level, ...]:
-    """From coarse to fine; the last is the whole file."""
+    """List a tile's levels from coarse to fine; the last is the whole file."""
     return (*tile.levels, Level(tile.bytes, tile.anchors, tile.coupled_primitives))
 
 
