@@ -38,7 +38,9 @@ ROOT = Path(__file__).resolve().parents[1]
 WEB = ROOT / "web"
 sys.path.append(str(ROOT / "tests"))
 PIECE_SECONDS = 0.02  # of a file, at once
-QUIET_SECONDS = 3  # without a change of the picture, after which it was the last
+# Without a change of the picture, after which it was the last.
+QUIET_SECONDS = 3
+QUIET_PICTURES = 5
 MOST_SECONDS = 240
 
 # Shows a file in Spark from one camera, and notes when the picture changed, by thumbnails, as looking at them takes no
@@ -68,6 +70,7 @@ camera.quaternion.set(...rotation);
 const small = new OffscreenCanvas(48, 48).getContext("2d", { willReadFrequently: true });
 let before = null;
 window.first = window.last = null;
+window.unchanged = 0; // pictures of the whole file since the last change
 renderer.setAnimationLoop(() => {
   renderer.render(scene, camera);
   small.drawImage(canvas, 0, 0, 48, 48);
@@ -75,7 +78,8 @@ renderer.setAnimationLoop(() => {
   if (before && now.some((value, i) => Math.abs(value - before[i]) > 1)) {
     window.last = performance.now();
     window.first ??= window.last;
-  }
+    window.unchanged = 0;
+  } else if (window.isLoaded && (!isOurs || mesh.isSettled)) window.unchanged++;
   before = now;
 });
 """
@@ -185,10 +189,11 @@ def in_browser(entries: list[Entry], model: Any, options: argparse.Namespace) ->
                 def settled(opened: Any = opened, entry: Entry = entry) -> "tuple[float, float] | None":
                     if failed := opened.ask("window.failed"):
                         raise SystemExit(f"{entry.file.name}: {failed}")
-                    first, last, now = opened.ask(
-                        "window.isLoaded && window.first ? [first, last, performance.now()] : [0, 0, 0]"
+                    first, last, now, unchanged = opened.ask(
+                        "window.first ? [first, last, performance.now(), unchanged] : [0, 0, 0, 0]"
                     )
-                    return (first, last) if first and now - last > 1000 * QUIET_SECONDS else None
+                    is_last = now - last > 1000 * QUIET_SECONDS and unchanged >= QUIET_PICTURES
+                    return (first, last) if first and is_last else None
 
                 visits.append(until(settled, f"a picture of {entry.file.name}", MOST_SECONDS))
                 drawn = opened.picture()
