@@ -23,8 +23,11 @@ const OUTWARDS = 0.2;
 /** Of the scene's extent: cameras that stand closer together turn in one place. */
 const ONE_PLACE = 0.25;
 
-/** Of the anchors: what so many belong to, in the middle of the cameras, is what these were around. */
-const SURROUNDED = 0.05;
+/**
+ * Of the anchors: what so many belong to, in the middle of cameras that look inwards, is what these were around. Few are
+ * enough, as the beginning of a file has most of its anchors in the background.
+ */
+const SURROUNDED = 0.002;
 
 /** `positions`: 3 numbers for each anchor. */
 export function firstView(
@@ -92,7 +95,8 @@ function looksOutwards(positions: ArrayLike<number>, poses: Pose[], extent: numb
   const middle = meanOf(poses.map(({ centre }) => centre));
   const offsets = poses.map(({ centre }) => add(centre, middle, -1));
   const spread = Math.max(...offsets.map((offset) => Math.hypot(...offset)));
-  if (spread < ONE_PLACE * extent && !isAround(positions, middle, spread / 2)) return true;
   const cosines = poses.map(({ forward }, i) => dot(forward, unit(offsets[i]!)));
-  return cosines.reduce((sum, cosine) => sum + cosine, 0) / cosines.length > OUTWARDS;
+  const outwards = cosines.reduce((sum, cosine) => sum + cosine, 0) / cosines.length;
+  if (outwards < -OUTWARDS && isAround(positions, middle, spread / 2)) return false;
+  return spread < ONE_PLACE * extent || outwards > OUTWARDS;
 }
