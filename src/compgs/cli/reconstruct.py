@@ -74,7 +74,7 @@ class Reconstruct(Command):
     """Threads to use; all cores by default."""
 
     seed: Annotated[int, arg(metavar="N")] = 0
-    """Of everything random."""
+    """Seed of everything random."""
 
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace a scene that is in SCENE already."""

@@ -96,11 +96,11 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
     """Frames per second of a video or animation."""
 
     width: Annotated[int | None, arg(metavar="PIXELS", help_behavior_hint=NO_DEFAULT)] = None
-    """Of the images of the way. With --width or --height alone, and with neither, they have the shape of the capture's;
-    with neither they are about 640 x 480 pixels."""
+    """Width of the images of the way. With --width or --height alone, and with neither, they have the shape of the
+    capture's; with neither they are about 640 x 480 pixels."""
 
     height: Annotated[int | None, arg(metavar="PIXELS", help_behavior_hint=NO_DEFAULT)] = None
-    """Of the images of the way."""
+    """Height of the images of the way."""
 
     up: Annotated[
         tuple[float, float, float] | None,
