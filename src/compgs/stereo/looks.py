@@ -41,12 +41,12 @@ def look_of(view: View, device: torch.device) -> Look:
     """One view, small. Raises UnreadableImage."""
     camera = small_camera(view.camera)
     size = camera.height, camera.width
-    image = torch.from_numpy(np.ascontiguousarray(view.image)).permute(2, 0, 1)[None].float()
+    image = torch.tensor(view.image).permute(2, 0, 1)[None].float()
     small = nn.functional.interpolate(image, size, mode="area")[0].permute(1, 2, 0)
     gray = (small * torch.tensor(LUMA)).sum(-1) / 255.0
     counted = None
     if view.mask is not None:
-        mask = torch.from_numpy(np.ascontiguousarray(view.mask))[None, None].float()
+        mask = torch.tensor(view.mask)[None, None].float()
         # A pixel counts where all of what it is made of does: an edge of a mask is none of the scene.
         counted = nn.functional.interpolate(mask, size, mode="area")[0, 0].numpy() > 0.999
     return Look(camera, small.round().to(torch.uint8).numpy(), gray.to(device), counted)
