@@ -72,7 +72,11 @@ test("one looks around where the cameras did, and turns about what they surround
   const far = ball.map((x) => 30 * x); // what stands behind something that was walked around
   const around = circle(8, 4).map((place) => looking(place, [0, 0, 0]));
   const inFront = [...ball.slice(0, 6), ...far, ...far];
-  assert.equal(firstView(inFront, { up: [0, -1, 0], views: around }, 30).isInside, false, "before a far background");
+  assert.equal(
+    firstView(inFront, { up: [0, -1, 0], views: around }, 30).isInside,
+    false,
+    "before a far background",
+  );
   const forward = circle(8, 1).map(([x, , z]) => looking([x, z, 0], [x, z, 9]));
   assert.equal(of(forward), false, "all look the same way");
 });

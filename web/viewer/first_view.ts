@@ -48,7 +48,9 @@ export function firstView(
 function amongFullest(poses: Pose[], counts: number[]): number {
   const most = Math.max(...counts);
   const mean = meanOf(poses.map(({ forward }) => forward));
-  const agreement = poses.map(({ forward }, i) => (counts[i]! >= AS_GOOD * most ? dot(forward, mean) : -Infinity));
+  const agreement = poses.map(({ forward }, i) =>
+    counts[i]! >= AS_GOOD * most ? dot(forward, mean) : -Infinity,
+  );
   return agreement.indexOf(Math.max(...agreement));
 }
 
@@ -84,7 +86,8 @@ function isAround(positions: ArrayLike<number>, place: Vector, radius: number): 
   let [near, all] = [0, 0];
   for (let at = 0; at + 2 < positions.length; at += stride) {
     all++;
-    if (Math.hypot(...add([positions[at]!, positions[at + 1]!, positions[at + 2]!], place, -1)) < radius) near++;
+    if (Math.hypot(...add([positions[at]!, positions[at + 1]!, positions[at + 2]!], place, -1)) < radius)
+      near++;
   }
   return near > SURROUNDED * all;
 }
