@@ -119,3 +119,18 @@ def test_without_pycolmap_the_remedy_is_said_before_anything_is_done(
 def test_options_out_of_range_are_refused(options: dict[str, object], walls: Walls, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=f"{next(iter(options))} .*expected"):
         reconstruct(walls.folder, tmp_path / "scene", ReconstructOptions(**options))  # type: ignore[arg-type]
+
+
+def test_photographs_that_look_alike_are_joined_as_if_all_had_been_compared(
+    walls: Walls, found: Reconstruction, tmp_path: Path
+) -> None:
+    """Names with spaces, which lists of pairs cannot hold, stay as they are."""
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    for path in walls.folder.iterdir():
+        (photographs / path.name.replace("_", " ")).write_bytes(path.read_bytes())
+    result = reconstruct(photographs, tmp_path / "scene", ReconstructOptions(matching="retrieval"))
+    assert result.matching == "retrieval" and result.registered == found.registered == 7
+    assert result.points > 0.8 * found.points
+    names = {view.name for view in load_scene(tmp_path / "scene", holdout=False).train_views}
+    assert names == {path.name for path in photographs.iterdir()}

@@ -45,9 +45,10 @@ class Reconstruct(Command):
     output: Annotated[Path, arg(aliases=["-o"], metavar="SCENE")]
     """Folder for the scene: images/, sparse/0, reconstruction.json and reconstruction.png."""
 
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which photographs are compared: each with each, or each with its neighbours by name, as in a video. By default
-    sequential for videos and for more than 300 photographs."""
+    matching: Literal["auto", "exhaustive", "sequential", "retrieval"] = "auto"
+    """Which photographs are compared: each with each, each with its neighbours by name, as in a video, or each with
+    neighbours by name and with those that look alike. By default sequential for videos, and retrieval for more than 60
+    photographs."""
 
     overlap: Annotated[int, arg(metavar="N")] = 10
     """Neighbours on each side in sequential matching."""
@@ -133,7 +134,7 @@ def show(result: "Reconstruction") -> None:
 
 def remedy(matching: str) -> str:
     """What lets COLMAP join more photographs, after it has compared them in this way."""
-    search = "--matching exhaustive and --features 8192" if matching == "sequential" else "--features 8192"
+    search = "--features 8192" if matching == "exhaustive" else "--matching exhaustive and --features 8192"
     return f"{search} may join more, and more photographs between those that lie far apart surely will"
 
 

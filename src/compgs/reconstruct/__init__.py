@@ -4,6 +4,7 @@
 photographs.py   finds photographs, stores them upright            video.py    the sharpest frames of a video
 cameras.py       which photographs share a camera                   mapping.py  the three stages of COLMAP, run aside
 worker.py        the process that runs them                         report.py   what came out: numbers and a picture
+retrieval.py     which photographs are worth comparing
 ```
 """
 

@@ -15,6 +15,7 @@ from typing import Any, Literal
 from compgs.errors import SceneError
 from compgs.extras import require
 from compgs.reconstruct.cameras import SharedCamera
+from compgs.reconstruct.retrieval import ALIKE, NEAR
 
 Stage = Literal["features", "matching", "mapping"]
 Progress = Callable[[Stage, int, int], None]  # stage, done, total
@@ -32,7 +33,7 @@ class Job:
     models: str  # folder for sparse models
     lens: str  # COLMAP's name of the camera model
     shared: SharedCamera
-    matching: Literal["exhaustive", "sequential"]
+    matching: Literal["exhaustive", "sequential", "retrieval"]
     overlap: int  # sequential: neighbours on each side
     features: int  # most of a photograph
     feature_size: int  # pixels: larger photographs are shrunk to find features
@@ -89,6 +90,8 @@ def _worker(job: dict[str, Any], log: Path) -> Iterator["subprocess.Popen[str]"]
 def matched_pairs(photographs: int, job: Job) -> int:
     """How many pairs of photographs are compared, about."""
     every = photographs * (photographs - 1) // 2
+    if job.matching == "retrieval":
+        return min(every, photographs * (NEAR + ALIKE))
     # `overlap` neighbours, and as many at distances of powers of two
     return min(every, 2 * photographs * job.overlap) if job.matching == "sequential" else every
 
@@ -123,6 +126,8 @@ def _watch(
             # Of the model that is being built: a later one starts again.
             registered = min(photographs, registered + told["count"])
             progress("mapping", registered, photographs)
+        elif told["event"] == "pairs":
+            pairs = told["count"]
         else:
             stage = told["event"]
             progress(told["event"], 0, pairs if stage == "matching" else photographs)

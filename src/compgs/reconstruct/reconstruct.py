@@ -28,8 +28,8 @@ from compgs.reconstruct.report import picture, summary
 from compgs.scene.colmap import SparseModel, read_sparse_model
 from compgs.scene.masks import FOLDER as MASKS
 
-# Photographs up to which each is compared with each: 44 850 pairs, some hours on two cores.
-EXHAUSTIVE_UP_TO = 300
+# Photographs up to which each is compared with each; of more, those that look alike are (`retrieval`).
+EXHAUSTIVE_UP_TO = 60
 LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 
 
@@ -37,7 +37,7 @@ LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPE
 class ReconstructOptions:
     """How poses are found. The defaults suit some 30 to 300 photographs, or a video, of something that stands still."""
 
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    matching: Literal["auto", "exhaustive", "sequential", "retrieval"] = "auto"
     overlap: int = 10  # sequential: neighbours with which a photograph is compared, on each side
     shared: Literal["auto"] | SharedCamera = "auto"  # photographs of one camera share its lens
     lens: str = "auto"  # one of LENSES; auto: OPENCV where many photographs determine it, else SIMPLE_RADIAL
@@ -89,7 +89,7 @@ def _reconstruct_in(
     try:
         result = _reconstruct(source, scene, work, options, _Clock(progress or _silent))
         if note is not None and result.matching == "exhaustive" and result.photographs > EXHAUSTIVE_UP_TO:
-            note("every pair of photographs was compared; --matching sequential is faster for ordered ones")
+            note("every pair of photographs was compared; --matching retrieval is faster")
         _move_into_place(work / "scene", scene)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -112,12 +112,7 @@ def _reconstruct(
         else _stored(source, images, masks=not options.undistort)
     )
     shared = shared_camera(photographs) if options.shared == "auto" else options.shared
-    many = len(photographs) > EXHAUSTIVE_UP_TO
-    matching = options.matching
-    if matching == "auto":
-        matching = (
-            "sequential" if (ordered and len(photographs) > 2 * options.overlap) or many else "exhaustive"
-        )
+    matching = chosen_matching(options, len(photographs), ordered=ordered)
     job = Job(
         images=str(images),
         database=str(work / "database.db"),
@@ -155,10 +150,22 @@ def _reconstruct(
         seconds=seconds,
         masks=sum(photograph.mask is not None for photograph in photographs),
         masks_kept=not options.undistort,
+        video=ordered,
     )
     write_json(target / "reconstruction.json", summary(result, model))
     picture(model).save(target / "reconstruction.png")
     return result
+
+
+def chosen_matching(
+    options: ReconstructOptions, photographs: int, *, ordered: bool
+) -> Literal["exhaustive", "sequential", "retrieval"]:
+    """Which photographs are compared; `ordered`: they are frames of a video."""
+    if options.matching != "auto":
+        return options.matching
+    if ordered and photographs > 2 * options.overlap:
+        return "sequential"
+    return "exhaustive" if photographs <= EXHAUSTIVE_UP_TO else "retrieval"
 
 
 def _check(options: ReconstructOptions) -> None:

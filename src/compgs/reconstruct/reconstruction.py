@@ -20,4 +20,5 @@ class Reconstruction:
     matching: str
     seconds: dict[str, float]  # by stage
     masks: int = 0  # found, of which photographs have one
+    video: bool = False  # the photographs are frames of one
     masks_kept: bool = True  # in the scene; undistorted photographs have other pixels than their masks

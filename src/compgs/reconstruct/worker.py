@@ -7,6 +7,8 @@ Stages and registered photographs are told as lines of JSON on the standard outp
 
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,12 @@ def find_poses(job: dict[str, Any]) -> None:
         pairing = pycolmap.SequentialPairingOptions()
         pairing.overlap = job["overlap"]
         pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing)
+    elif job["matching"] == "retrieval":
+        listed = pycolmap.ImportedPairingOptions()
+        listed.match_list_path = database.with_name("pairs.txt")
+        with numbered(database):
+            listed.match_list_path.write_text(alike_pairs(database, job["seed"]), encoding="utf-8")
+            pycolmap.match_image_pairs(database, matching_options=matching, pairing_options=listed)
     else:
         pycolmap.match_exhaustive(database, matching_options=matching)
 
@@ -62,6 +70,38 @@ def find_poses(job: dict[str, Any]) -> None:
         initial_image_pair_callback=lambda: _tell("registered", 2),
         next_image_callback=lambda: _tell("registered", 1),
     )
+
+
+@contextmanager
+def numbered(database: Path) -> Iterator[None]:
+    """Inside, images are called by their number in the order of their names: lists of pairs have no spaces in names."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        images = sorted(opened.read_all_images(), key=lambda image: image.name)
+        names = [image.name for image in images]
+        for number, image in enumerate(images):
+            image.name = f"{number:08}"
+            opened.update_image(image)
+    yield
+    with pycolmap.Database.open(database) as opened:
+        for image, name in zip(images, names, strict=True):
+            image.name = name
+            opened.update_image(image)
+
+
+def alike_pairs(database: Path, seed: int) -> str:
+    """Lines of two images each: what to compare, by the features that are in the database."""
+    import pycolmap
+
+    from compgs.reconstruct.retrieval import pairs_to_compare
+
+    with pycolmap.Database.open(database) as opened:
+        images = sorted(opened.read_all_images(), key=lambda image: image.name)
+        descriptors = [opened.read_descriptors(image.image_id).data for image in images]
+    pairs = pairs_to_compare(descriptors, seed=seed)
+    _tell("pairs", len(pairs))
+    return "".join(f"{images[first].name} {images[second].name}\n" for first, second in pairs)
 
 
 def undistort(job: dict[str, Any]) -> None:
