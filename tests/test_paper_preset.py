@@ -105,6 +105,8 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         "training.seed": "",
         "training.target_bytes": "",
         "training.exposure": "off",
+        "training.poses": "no rule is applied",
+        "training.robust": "off",
         "training.appearance_dtype": "float32",
         "training.entropy_lr_steps": "bounds of short runs",
         "training.viewpoints": "what the file keeps beside the scene",

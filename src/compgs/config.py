@@ -202,11 +202,22 @@ class TrainingConfig:
     entropy_lr_steps: Annotated[int, Range(0, 10_000_000)] = 0
     # number format of the networks of opacity and color; bfloat16 is meant for GPUs
     appearance_dtype: Literal["float32", "bfloat16"] = "float32"
-    # true: learn an affine change of color for each training view, beside the scene, for photographs of differing
-    # exposure or white balance; the file does not hold it (`training/step/exposures.py`)
+    # true: learn exposure and color of each training photograph, vignetting and response of each lens, for photographs
+    # that cameras exposed and balanced by themselves; the file holds none of it (`training/step/photometry.py`)
     exposure: bool = False
+    # learn a small turn and shift of each training view's camera, beside the scene; the file holds none of it
+    # (`training/step/poses.py`); auto: if the reconstruction's mean error is above a pixel, or the photographs are
+    # frames of a video
+    poses: Literal["auto", "on", "off"] = "auto"
+    # true: leave out parts of training photographs that the scene keeps failing to show, such as people who walk
+    # through (`training/step/robust.py`)
+    robust: bool = False
     # cameras of training views that the file keeps, at most: one for each 100 anchors, and three at least; 0: none
     viewpoints: Annotated[int, Range(0, MAX_VIEWPOINTS)] = 12
+
+    def learns_poses(self, *, in_doubt: bool) -> bool:
+        """Whether poses are learned where they are `in_doubt` or not, unless a plan says otherwise."""
+        return self.poses == "on" or (self.poses == "auto" and in_doubt)
 
     @property
     def borders(self) -> Phases:

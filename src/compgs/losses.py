@@ -17,7 +17,7 @@ hyperpriors, and the covariance parameters. It can be normalized in two ways:
 Bits themselves are counted in `entropy`; only this module divides them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,7 +45,8 @@ class Target:
 
     image: Tensor  # [H, W, 3] uint8
     counted: Tensor | None = None  # [H, W] bool: pixels to compare; None: all
-    exposure: Tensor | None = None  # [3, 4] of the view, see `exposed`; None: the scene's own
+    # What the photograph's camera makes of a rendering [H, W, 3]; None: nothing.
+    taken: Callable[[Tensor], Tensor] | None = None
 
     @staticmethod
     def from_image(
@@ -62,9 +63,9 @@ def _tensor(array: np.ndarray, device: torch.device | str) -> Tensor:
     return torch.from_numpy(np.require(array, requirements=("C", "W"))).to(device)
 
 
-def exposed(image: Tensor, exposure: Tensor | None) -> Tensor:
-    """[H, W, 3] as a camera of that exposure [3, 4] shows it: a matrix on each color, and an offset."""
-    return image if exposure is None else image @ exposure[:, :3].T + exposure[:, 3]
+def as_taken(image: Tensor, target: Target) -> Tensor:
+    """The rendering [H, W, 3] as the target's camera shows it."""
+    return image if target.taken is None else target.taken(image)
 
 
 def photometric_loss(
@@ -72,11 +73,11 @@ def photometric_loss(
     target: Target | Tensor,  # [H, W, 3] uint8, or of the image's type and 0 to 1
     ssim_weight: float = 0.2,
 ) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM), as in 3DGS, at the target's exposure; means over its pixels that count
-    (`numerics/ssim.py`).
+    """(1 - w) L1 + w (1 - SSIM), as in 3DGS, as the target's camera shows the image; means over its pixels
+    that count (`numerics/ssim.py`).
     """
     target = target if isinstance(target, Target) else Target(target)
-    y, counted, image = target.image, target.counted, exposed(image, target.exposure)
+    y, counted, image = target.image, target.counted, as_taken(image, target)
     assert image.shape == y.shape, f"image {tuple(image.shape)}, target {tuple(y.shape)}"
     if where.in_kernels(image) and y.dtype in (torch.uint8, torch.float32):
         return _FusedPhotometric.apply(image, y, counted, ssim_weight)

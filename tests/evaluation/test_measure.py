@@ -116,7 +116,9 @@ def test_files_say_what_the_results_say(file: Path, tmp_path: Path) -> None:
     scene = make_scene([101, 110, 90])
     output = tmp_path / "report"
     results = evaluate(file, scene, output=output, device="cpu")
-    assert json.loads((output / "results.json").read_text()) == results.to_dict()
+    # The colors of flat pictures are fitted exactly.
+    expected = {**results.to_dict(), "psnr_colors_fitted": None}
+    assert json.loads((output / "results.json").read_text()) == expected
     rows = json.loads((output / "per_view.json").read_text())
     assert [row["name"] for row in rows] == [view.name for view in scene.test_views]
     for row, view in zip(rows, scene.test_views, strict=True):
@@ -151,18 +153,16 @@ def test_results_say_how_far_held_out_views_are_from_training_views(file: Path) 
     assert alone.degrees_to_training is None and alone.per_view[0].degrees_to_training is None
 
 
-@pytest.mark.parametrize("exposure", [False, True])
 def test_held_out_views_that_cannot_be_measured_are_named_before_anything_is_rendered(
-    file: Path, exposure: bool, monkeypatch: pytest.MonkeyPatch
+    file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = make_scene([101, 110, 90])
     mask = np.zeros((24, 32), dtype=bool)
-    mask[:, :16] = exposure  # of the right half nothing
     masked = replace(scene.test_views[2], counted=mask)
     scene = replace(scene, test_views=(*scene.test_views[:2], masked))
     monkeypatch.setattr("compgs.evaluation.measure.timed_render", lambda *_: pytest.fail("rendered"))
     with pytest.raises(SceneError, match=r"folder/2\.jpg: its mask leaves no pixel"):
-        evaluate(file, scene, device="cpu", exposure=exposure)
+        evaluate(file, scene, device="cpu")
 
 
 def test_an_existing_report_is_kept_unless_asked(file: Path, tmp_path: Path) -> None:
@@ -299,15 +299,17 @@ def test_a_mask_that_leaves_nothing_is_named(file: Path) -> None:
         evaluate(file, masked(make_scene([1, 2]), {1: np.zeros((24, 32), dtype=bool)}), device="cpu")
 
 
-def test_with_exposure_the_right_half_is_measured_after_a_fit_to_the_left(file: Path) -> None:
-    """The file renders 100 everywhere; the photograph is 120 on the left, 130 on the right."""
-    scene = make_scene([120])
+def test_quality_is_told_with_and_without_colors_fitted(file: Path) -> None:
+    """The file renders 100 everywhere: another exposure of it is fitted, what a photograph shows beside it is not."""
+    darker = evaluate(file, make_scene([60]), device="cpu")
+    assert darker.psnr == pytest.approx(20 * math.log10(255 / 40), abs=1e-6)
+    assert darker.psnr_colors_fitted > 45
+    scene = make_scene([100])
     image = scene.test_views[0].image.copy()
-    image[:, 16:] = 130
-    views = (replace(scene.test_views[0], pixels=image),)
-    plain = evaluate(file, replace(scene, test_views=views), device="cpu")
-    results = evaluate(file, replace(scene, test_views=views), device="cpu", exposure=True)
-    assert results.psnr == pytest.approx(20 * math.log10(255 / 10), abs=1e-6)
-    assert results.psnr > plain.psnr
-    assert plain.to_dict()["exposure"] is None
-    assert "left half" in results.to_dict()["exposure"]
+    image[:, 16:] = 140
+    halves = evaluate(
+        file, replace(scene, test_views=(replace(scene.test_views[0], pixels=image),)), device="cpu"
+    )
+    assert halves.psnr_colors_fitted == pytest.approx(20 * math.log10(255 / 20), abs=0.1), "nearest is 120"
+    assert halves.to_dict()["psnr_colors_fitted"] == halves.psnr_colors_fitted
+    assert halves.per_view_list()[0]["ssim_colors_fitted"] == halves.ssim_colors_fitted

@@ -103,7 +103,7 @@ def whole_run(kind: str, scene: Scene, folder: Path) -> dict[str, Any]:
         "counts": counts,
         "primitives": trainer.primitives,
         "parameters": parameters(trainer),
-        "exposures": trainer.views.tensors()["exposure/change"].clone(),
+        "exposures": trainer.views.tensors()["photometry/photographs/numbers"].clone(),
     }
 
 

@@ -169,12 +169,12 @@ def test_a_pass_takes_fewer_steps_of_more_views() -> None:
 
 
 def test_each_step_takes_a_view_of_each_lane_and_a_pass_takes_all(blob_scene: Scene) -> None:
-    views = ViewsInTurn(blob_scene, CPU, 0, per_step=4)
+    views = ViewsInTurn(blob_scene, CPU, 0, TrainingConfig(views_per_step=4))
     for _ in range(3):
         steps = [views.next() for _ in range(2)]
         assert all([view % 4 for view in step] == [0, 1, 2, 3] for step in steps)
         assert sorted(steps[0] + steps[1]) == list(range(8))
-    three = ViewsInTurn(blob_scene, CPU, 0, per_step=3)
+    three = ViewsInTurn(blob_scene, CPU, 0, TrainingConfig(views_per_step=3))
     seen = [three.next() for _ in range(6)]
     assert sorted(step[0] for step in seen) == [0, 0, 3, 3, 6, 6]
     assert sorted(step[2] for step in seen) == [2, 2, 2, 5, 5, 5], "a shorter lane comes round earlier"
@@ -201,7 +201,7 @@ def test_a_run_of_several_views_a_step_continues_exactly(
     module = (lambda t: t.model.state_dict()) if kind is Trainer else (lambda t: t.named_parameters())
     for name, value in module(whole).items():
         assert torch.equal(value, module(second)[name]), name
-    assert whole.views.exposures.steps.sum() == 24 * 3
+    assert whole.views.photometry.photographs.steps.sum() == 24 * 3
 
 
 def test_views_that_show_nothing_do_not_stop_those_that_do(blob_scene: Scene, tiny_config: Config) -> None:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from compgs.formats.tiled import TileEntry
 
 WORST_VIEWS = 5  # that are named
+COLORS_DIFFER = 0.5  # dB by which a fit of colors raises the PSNR, for one line to say so
 
 console = Console(highlight=False, soft_wrap=True)
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -120,6 +121,10 @@ def quality_of(results: "Results") -> str:
     )
     measures += [] if results.flip is None else [f"FLIP {results.flip:.4f}"]
     views = f"{len(results.per_view)} held-out views of {results.width} x {results.height} pixels"
+    if results.psnr_colors_fitted > results.psnr + COLORS_DIFFER:
+        views += f"; PSNR, colors fitted: {results.psnr_colors_fitted:.2f} dB"
+    if results.psnr_poses_aligned is not None:
+        views += f"; PSNR, poses aligned: {results.psnr_poses_aligned:.2f} dB"
     return f"{', '.join(measures)} on {views}"
 
 
@@ -129,8 +134,6 @@ def say_remarks(results: "Results") -> None:
         warn(in_words_of_options(note))
     if results.lpips is None and results.lpips_note != "not asked for":
         say(f"LPIPS: {results.lpips_note}")
-    if results.exposure is not None:
-        say(results.exposure)
 
 
 def print_results(results: "Results") -> None:
@@ -140,6 +143,11 @@ def print_results(results: "Results") -> None:
     table.add_column(justify="right", style="bold")
     table.add_row("PSNR", f"{results.psnr:.2f} dB")
     table.add_row("SSIM", f"{results.ssim:.4f}")
+    table.add_row("PSNR, colors fitted", f"{results.psnr_colors_fitted:.2f} dB")
+    table.add_row("SSIM, colors fitted", f"{results.ssim_colors_fitted:.4f}")
+    if results.psnr_poses_aligned is not None:
+        table.add_row("PSNR, poses aligned", f"{results.psnr_poses_aligned:.2f} dB")
+        table.add_row("SSIM, poses aligned", f"{results.ssim_poses_aligned:.4f}")
     if results.lpips is not None:
         table.add_row("LPIPS", f"{results.lpips:.4f}")
         table.add_row("LPIPS as 3DGS measures it", f"{results.lpips_3dgs:.4f}")

@@ -64,9 +64,9 @@ class Evaluate(JsonOption, DecodingCommand, SceneOptions, SceneFileOrRunArgument
     """Also say where the error is: by region of the picture, by scale, by distance and by view. With -o, FOLDER gets
     errors.json and errors.png."""
 
-    exposure: FlagCreatePairsOff[bool] = False
-    """Give each rendering the exposure of its photograph, fitted to the left half, and measure the right half; as for
-    runs that were trained with --set training.exposure=true."""
+    align: FlagCreatePairsOff[bool] = False
+    """Also measure each view from where the file looks most like its photograph, for captures whose poses are not
+    exact; always done for runs that learned the poses of their training views (training.poses)."""
 
     def run(self) -> None:
         from compgs.opening import check_scene
@@ -94,9 +94,9 @@ class Evaluate(JsonOption, DecodingCommand, SceneOptions, SceneFileOrRunArgument
                 lpips=self.lpips_weights or self.lpips,
                 flip=self.flip,
                 errors=self.errors,
+                align=self.align or (run is not None and run.learned_poses(scene)),
                 device=self.device,
                 method=run.method if run else None,
-                exposure=self.exposure or (run is not None and run.config.training.exposure),
                 progress=progress,
             )
         if self.json:

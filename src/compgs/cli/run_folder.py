@@ -6,13 +6,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from compgs import __version__
 from compgs.config import Config, config_from_dict
 from compgs.errors import CheckpointError, OutputError
 from compgs.methods import METHODS
 from compgs.outputs import write_json
+
+if TYPE_CHECKING:
+    from compgs.scene.views import Scene
 
 SETTINGS_NAME = "config.json"
 CHECKPOINT_NAME = "checkpoint.safetensors"
@@ -46,6 +49,12 @@ class RunSettings:
     tile: dict[str, Any] | None = None  # of the run of one tile: what of the plan it needs (`tile_entry`)
     # What the training has decided (`training.plan.Plan.to_dict`); None before it has, and of methods without a plan.
     plan: dict[str, Any] | None = None
+
+    def learned_poses(self, scene: "Scene") -> bool:
+        """Whether the run learned the poses of the scene's training views."""
+        if self.plan is not None:
+            return bool(self.plan.get("poses", False))
+        return self.config.training.learns_poses(in_doubt=bool(scene.poses_in_doubt))
 
 
 def file_name(folder: Path, extension: str = ".cgs") -> str:

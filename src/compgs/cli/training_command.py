@@ -364,7 +364,7 @@ class TrainingCommand(ComputingCommand, SceneOptions):
         """Raises SceneError, before the first step, for a held-out view that could not be measured after the last."""
         from compgs.evaluation.held_out import check_held_out
 
-        check_held_out(scene, exposure=settings.config.training.exposure)
+        check_held_out(scene)
 
     def evaluate(self, scene: "Scene", file: Path, folder: Path, settings: RunSettings) -> None:
         if not scene.test_views:
@@ -383,7 +383,7 @@ class TrainingCommand(ComputingCommand, SceneOptions):
                 device=self.device,
                 progress=progress,
                 method=settings.method,
-                exposure=settings.config.training.exposure,
+                align=settings.learned_poses(scene),
             )
         if settings.plan is not None:
             add_facts(folder, {"plan": settings.plan}, RESULTS_NAME)

@@ -6,7 +6,8 @@
 | `comparison`, `compared_files` | put two files of one scene side by side, without photographs |
 | `reduction` | makes a file smaller without training, and measures what that loses |
 | `bd_rate` | compares two curves of quality over bytes |
-| `held_out`, `fit`, `exposure` | checks the views before they are measured, and adjusts their exposure |
+| `held_out`, `fit` | checks the views before they are measured |
+| `exposure`, `alignment` | fits colors of renderings, and places of cameras, to their photographs |
 | `importance` | measures what a primitive adds to the pictures |
 | `error_account`, `error_sheet`, `contact_sheet` | show where the error is, and the pictures beside the photographs |
 | `camera_path`, `capture_cameras`, `tour`, `clearance` | cameras without photographs, on ways clear of what is near |

@@ -163,7 +163,7 @@ def _places(
     if scene is not None:
         if not scene.test_views:
             raise SceneError(f"{scene.name}: no view is held out to compare with; load with hold-out")
-        check_held_out(scene, exposure=False)
+        check_held_out(scene)
         places = [_Place(view.name, view.camera, view) for view in scene.test_views]
         return places, f"held-out views of {scene.name}"
     if cameras is not None:

@@ -1,15 +1,13 @@
-"""Exposure of held-out views, for scenes whose photographs were not all taken alike.
+"""Colors of renderings beside photographs that were not all exposed and balanced alike.
 
-No training knows a held-out view's exposure, so it is fitted to half of the photograph, and the other half is what
-counts (the protocol of NeRF in the Wild, Martin-Brualla et al. 2021): an affine change of color between rendering and
-photograph, least squares over the left half; PSNR, SSIM and LPIPS are then of the right half alone.
+No training knows what the camera of a held-out view chose. So quality is told twice: as it is, and with the colors of
+each rendering fitted to its photograph by the affine change with the least squared error.
 """
 
 import numpy as np
 
-# Times the number of pixels: keeps the fit near to no change in what the half does not show. Of [0, 1] colors squared.
+# Times the number of pixels: keeps the fit near to no change in what a view does not show. Of [0, 1] colors squared.
 DAMPING = 1e-4
-DESCRIPTION = "affine color of each view, fitted to its left half; metrics of the right half"
 
 
 def fitted_exposure(
@@ -32,15 +30,8 @@ def at_exposure(rendering: np.ndarray, exposure: np.ndarray) -> np.ndarray:
     return np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
 
 
-def exposed_by_left_half(
-    rendering: np.ndarray, photograph: np.ndarray, mask: np.ndarray | None
+def with_fitted_colors(
+    rendering: np.ndarray, photograph: np.ndarray, mask: np.ndarray | None = None
 ) -> np.ndarray:
-    """The rendering [H, W, 3] uint8 at the exposure of its photograph, as the left half shows it."""
-    left = (slice(None), slice(None, rendering.shape[1] // 2))
-    exposure = fitted_exposure(rendering[left], photograph[left], None if mask is None else mask[left])
-    return at_exposure(rendering, exposure)
-
-
-def right_half(image: np.ndarray) -> np.ndarray:
-    """Return the half of [H, W, ...] that `exposed_by_left_half` has not looked at."""
-    return image[:, image.shape[1] // 2 :]
+    """The rendering [H, W, 3] uint8 in the colors of its photograph."""
+    return at_exposure(rendering, fitted_exposure(rendering, photograph, mask))

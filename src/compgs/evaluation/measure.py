@@ -14,11 +14,12 @@ from compgs import __version__, metrics
 from compgs.cameras import Camera
 from compgs.devices import chosen_device, device_name
 from compgs.errors import SceneError
+from compgs.evaluation.alignment import aligned_camera
 from compgs.evaluation.camera_path import camera_entry
 from compgs.evaluation.contact_sheet import contact_sheet, striped
 from compgs.evaluation.error_account import ErrorSums
 from compgs.evaluation.error_sheet import error_sheet
-from compgs.evaluation.exposure import DESCRIPTION, exposed_by_left_half, right_half
+from compgs.evaluation.exposure import with_fitted_colors
 from compgs.evaluation.fit import misfits
 from compgs.evaluation.held_out import check_held_out, check_view, degrees_to_training
 from compgs.evaluation.results import Results, ViewResult
@@ -48,10 +49,10 @@ def evaluate(
     lpips: bool | str | Path = False,
     flip: bool = False,
     errors: bool = False,
+    align: bool = False,
     device: "Device | None" = None,
     progress: Callable[[int, int], None] | Literal[False] | None = None,
     method: str | None = None,
-    exposure: bool = False,
     truth: str = "photograph",
 ) -> Results:
     """Open a file of any known format (`compgs.formats`) and compare its renderings with a scene's held-out views.
@@ -65,9 +66,10 @@ def evaluate(
     that it was made from another scene, or from views or sizes of images other than these, `notes` of the results say
     so. `truth`: what the views' images are, as the contact sheet calls them.
 
-    Pixels that a view's mask leaves out do not count. With `exposure`, for scenes that were trained with exposures of
-    their views, each rendering gets that of its view first, fitted to the left half, and the right half is measured
-    (`compgs.evaluation.exposure`). With `errors`, the results say where the error is
+    Pixels that a view's mask leaves out do not count. PSNR and SSIM are measured twice: as they are, and with the
+    colors of each rendering fitted to its photograph, as cameras expose and balance each photograph by themselves
+    (`compgs.evaluation.exposure`). With `align`, for captures whose poses are not exact, also from where the model
+    looks most like each photograph (`compgs.evaluation.alignment`). With `errors`, the results say where the error is
     (`compgs.evaluation.error_account`); `errors.json` and `errors.png` are then written, too.
 
     Raises BitstreamError, SplatFileError, OutputError, SceneError if the scene holds no view out or a mask leaves
@@ -82,7 +84,7 @@ def evaluate(
         raise SceneError(
             f"{scene.name}: no view is held out, so there is nothing to evaluate on; load with hold-out"
         )
-    check_held_out(scene, exposure=exposure)
+    check_held_out(scene)
     angles = degrees_to_training(scene)
     chosen = chosen_device(device)
     model, first_seconds = timed_decode(path, chosen, scene.background)
@@ -97,9 +99,9 @@ def evaluate(
     images: list[np.ndarray] = []
     for i, view in enumerate(scene.test_views):
         image, seconds = timed_render(model, view.camera)
-        if exposure:
-            image = exposed_by_left_half(image, view.image, view.mask)
-        seen, photograph, mask = compared(image, view, exposure)
+        seen, photograph, mask = compared(image, view)
+        fitted = with_fitted_colors(seen, photograph, mask)
+        aligned = timed_render(model, aligned_camera(model, view))[0] if align else None
         distances: metrics.LpipsDistances | None = None
         if network is not None and lpips_note is None:
             try:
@@ -112,6 +114,10 @@ def evaluate(
                 file=f"{i:05d}.png",
                 psnr=metrics.psnr(seen, photograph, mask),
                 ssim=metrics.ssim(seen, photograph, mask),
+                psnr_colors_fitted=metrics.psnr(fitted, photograph, mask),
+                ssim_colors_fitted=metrics.ssim(fitted, photograph, mask),
+                psnr_poses_aligned=None if aligned is None else metrics.psnr(aligned, photograph, mask),
+                ssim_poses_aligned=None if aligned is None else metrics.ssim(aligned, photograph, mask),
                 lpips=None if distances is None else distances.lpips,
                 lpips_3dgs=None if distances is None else distances.lpips_3dgs,
                 render_seconds=seconds,
@@ -121,7 +127,7 @@ def evaluate(
         )
         if sums is not None:
             distance = depth(model, view.camera)
-            sums.add(view.name, seen, photograph, mask, right_half(distance) if exposure else distance)
+            sums.add(view.name, seen, photograph, mask, distance)
         images.append(image)
         if progress:
             progress(i + 1, len(scene.test_views))
@@ -143,7 +149,6 @@ def evaluate(
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
         lpips_note=lpips_note,
         method=method,
-        exposure=DESCRIPTION if exposure else None,
         per_view=tuple(rows),
         notes=misfits(model.viewpoints, scene),
         errors=None if sums is None else sums.account(),
@@ -166,19 +171,13 @@ def lpips_or_why_not(
         return None, f"unavailable: {reason}"
 
 
-def compared(
-    rendering: np.ndarray, view: View, half: bool = False
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Rendering, photograph [H, W, 3] and mask [H, W] of what is measured, or of the right `half` of it.
+def compared(rendering: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Rendering, photograph [H, W, 3] and mask [H, W] of what is measured.
 
     Raises SceneError if the mask leaves nothing.
     """
-    check_view(view, exposure=half)
-    photograph, mask = view.image, view.mask
-    if half:
-        rendering, photograph = right_half(rendering), right_half(photograph)
-        mask = None if mask is None else right_half(mask)
-    return rendering, photograph, mask
+    check_view(view)
+    return rendering, view.image, view.mask
 
 
 def timed_render(model: Renderable, camera: Camera) -> tuple[np.ndarray, float]:

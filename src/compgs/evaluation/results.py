@@ -11,6 +11,8 @@
 | views, width, height | number of held-out views; pixels of the first |
 | psnr | dB, mean over the views; null if infinite: all renderings are perfect |
 | ssim | mean over the views |
+| psnr_colors_fitted, ssim_colors_fitted | the same, with the colors of each rendering fitted to its photograph |
+| psnr_poses_aligned, ssim_poses_aligned | from where the file looks most like each photograph; null: not asked for |
 | lpips | on VGG16, images given to it in [-1, 1]: mean over the views, or null; `lpips_note` then says why |
 | lpips_3dgs | the same, images given in [0, 1] as the release of 3DGS does: what its field's tables have |
 | flip | mean over the views, or null: it was not asked for |
@@ -24,12 +26,11 @@
 | sha256 | of the file; of tiles that of the manifest, which has theirs |
 | split | how the held-out views were chosen, in words; empty where that is not known |
 | degrees_to_training | angle from a held-out view to the nearest training view, mean over the views; or null |
-| exposure | null, or how renderings got the exposure of their photographs, and what was measured then |
 | notes | sentences: in what the scene is not what the file was trained on, as far as the file's cameras tell |
 
-`per_view.json`: a list in the views' order with `name`, `file` (of `test/renders` and `test/gt`), `psnr`,
-`ssim`, `lpips`, `lpips_3dgs`, `flip`, `render_seconds`, `degrees_to_training`: the angle to the nearest training view
-(`compgs.scene.angles`), or null.
+`per_view.json`: a list in the views' order with `name`, `file` (of `test/renders` and `test/gt`), `psnr`, `ssim`,
+`psnr_colors_fitted`, `ssim_colors_fitted`, `psnr_poses_aligned`, `ssim_poses_aligned`, `lpips`, `lpips_3dgs`, `flip`,
+`render_seconds`, `degrees_to_training`: the angle to the nearest training view (`compgs.scene.angles`), or null.
 """
 
 import dataclasses
@@ -53,9 +54,15 @@ class ViewResult:
     file: str  # of the image in test/renders and test/gt
     psnr: float  # dB
     ssim: float
+    psnr_colors_fitted: float  # dB, after an affine fit of the rendering's colors (`evaluation/exposure.py`)
+    ssim_colors_fitted: float
     lpips: float | None  # images given in [-1, 1]
     render_seconds: float
     flip: float | None = None
+    psnr_poses_aligned: float | None = (
+        None  # dB, from where the file looks most like it (`evaluation/alignment.py`)
+    )
+    ssim_poses_aligned: float | None = None
     lpips_3dgs: float | None = None  # images given in [0, 1]
     degrees_to_training: float | None = None  # angle to the nearest training view; None: there is none
 
@@ -82,7 +89,6 @@ class Results:
     lpips_note: str | None  # why there is no LPIPS
     method: str | None  # that wrote the file, where it is known
     per_view: tuple[ViewResult, ...]
-    exposure: str | None = None  # how renderings got that of their photographs; None: they did not
     notes: tuple[str, ...] = ()  # in what the scene is not what the file was trained on (`evaluation/fit.py`)
     errors: "ErrorAccount | None" = None  # where the error is, if that was asked for; written to errors.json
     split: str = ""  # how the held-out views were chosen, in words
@@ -97,24 +103,43 @@ class Results:
         return fmean(view.ssim for view in self.per_view)
 
     @property
+    def psnr_colors_fitted(self) -> float:
+        """dB, mean over the views: with the colors of each rendering fitted to its photograph."""
+        return fmean(view.psnr_colors_fitted for view in self.per_view)
+
+    @property
+    def ssim_colors_fitted(self) -> float:
+        return fmean(view.ssim_colors_fitted for view in self.per_view)
+
+    @property
+    def psnr_poses_aligned(self) -> float | None:
+        """dB, mean over the views: from where the file looks most like each photograph; None: not asked for."""
+        return self._mean("psnr_poses_aligned")
+
+    @property
+    def ssim_poses_aligned(self) -> float | None:
+        return self._mean("ssim_poses_aligned")
+
+    @property
     def lpips(self) -> float | None:
-        values = [view.lpips for view in self.per_view if view.lpips is not None]
-        return fmean(values) if len(values) == len(self.per_view) else None
+        return self._mean("lpips")
 
     @property
     def lpips_3dgs(self) -> float | None:
-        values = [view.lpips_3dgs for view in self.per_view if view.lpips_3dgs is not None]
-        return fmean(values) if len(values) == len(self.per_view) else None
+        return self._mean("lpips_3dgs")
 
     @property
     def flip(self) -> float | None:
-        values = [view.flip for view in self.per_view if view.flip is not None]
-        return fmean(values) if len(values) == len(self.per_view) else None
+        return self._mean("flip")
 
     @property
     def degrees_to_training(self) -> float | None:
         """Mean over the views of the angle to the nearest training view."""
-        values = [view.degrees_to_training for view in self.per_view if view.degrees_to_training is not None]
+        return self._mean("degrees_to_training")
+
+    def _mean(self, measure: str) -> float | None:
+        """Mean over the views, or None where not all have it."""
+        values = [value for view in self.per_view if (value := getattr(view, measure)) is not None]
         return fmean(values) if len(values) == len(self.per_view) else None
 
     @property
@@ -157,6 +182,10 @@ class Results:
             "height": self.height,
             "psnr": self.psnr,
             "ssim": self.ssim,
+            "psnr_colors_fitted": self.psnr_colors_fitted,
+            "ssim_colors_fitted": self.ssim_colors_fitted,
+            "psnr_poses_aligned": self.psnr_poses_aligned,
+            "ssim_poses_aligned": self.ssim_poses_aligned,
             "lpips": self.lpips,
             "lpips_3dgs": self.lpips_3dgs,
             "lpips_note": self.lpips_note,
@@ -177,7 +206,6 @@ class Results:
             "sha256": self.sha256,
             "split": self.split,
             "degrees_to_training": self.degrees_to_training,
-            "exposure": self.exposure,
             "notes": list(self.notes),
         }
 

@@ -20,6 +20,8 @@ SPLAT_SETTINGS = (
     "training.seed",
     "training.ssim_weight",
     "training.exposure",
+    "training.poses",
+    "training.robust",
 )
 # Of files in the shared container: `compgs.formats.packed.SUFFIX`, without loading the formats.
 PACKED_SUFFIX = ".packed"

@@ -6,11 +6,12 @@
 | `capture` | what the reader of each layout hands over, before any pixel is read |
 | `colmap`, `colmap_capture`, `colmap_writer` | COLMAP's models and data sets |
 | `blender`, `nerfstudio`, `transforms`, `frames`, `points_of_frames`, `ply_points` | layouts with poses in JSON |
-| `images`, `image_cache`, `pixels`, `sizes` | photographs: read, kept, converted, reduced |
+| `images`, `image_cache`, `pixels`, `sizes`, `headers` | photographs: read, kept, converted, reduced; their headers |
 | `lenses`, `undistort` | lens distortion, and how it is taken out |
 | `masks`, `mask_files` | which pixels count |
 | `names`, `text_files` | names and texts as other programs write them |
 | `hold_out`, `split_names`, `angles` | which views are held out, and how far they are from the others |
+| `doubt` | whether poses may be off by a pixel |
 | `sight`, `viewpoints` | what cameras see, and the few that stand for all |
 | `no_poses`, `unused` | what to say of folders without poses, and of files that are not used |
 | `generated`, `ray_tracing` | a generated scene |
@@ -32,6 +33,7 @@ from compgs.scene.blender import read_blender
 from compgs.scene.capture import Capture, check_inside
 from compgs.scene.colmap import find_sparse_model
 from compgs.scene.colmap_capture import read_colmap
+from compgs.scene.doubt import poses_in_doubt
 from compgs.scene.hold_out import Split, check_split, every, sector
 from compgs.scene.images import Progress, load_views
 from compgs.scene.mask_files import with_masks, without_empty
@@ -73,7 +75,7 @@ def load_scene(
     """
     check_reading(downscale, test_every, background, split)
     folder = as_path(path, "path", "folder")
-    capture = _read_layout(folder, images)
+    capture = as_given = _read_layout(folder, images)
     _check_views(capture, folder)
     for posed in capture.images:
         check_inside(posed.path, (folder, folder / images), f"the image of the view {posed.name!r}")
@@ -112,6 +114,7 @@ def load_scene(
         extent=extent,
         source=folder,
         notes=(*capture.notes, *other_formats, *of_size, *of_split, *of_masks, *of_points, *unused),
+        poses_in_doubt=poses_in_doubt(folder, as_given, found),
         split=rule,
     )
 

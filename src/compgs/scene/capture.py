@@ -40,6 +40,8 @@ class Capture:
     notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()  # that were read, beside images and masks
     split: str = ""  # what names the held-out views; empty: nothing
+    # Mean distance from where points are seen to where they should be, pixels of the cameras; None: not known.
+    reprojection_error: float | None = None
 
 
 def usable_positions(positions: np.ndarray) -> np.ndarray:  # positions: [P, 3] float64

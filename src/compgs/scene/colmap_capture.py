@@ -71,6 +71,7 @@ def read_colmap(folder: Path, sparse: Path, images: Path) -> Capture:
         notes=notes + of_split,
         files=model.files + files,
         split=" and ".join(str(file.relative_to(folder)) for file in lists) if held_out else "",
+        reprojection_error=_mean_error(model),
     )
 
 
@@ -92,6 +93,13 @@ def _points(model: SparseModel, sparse: Path) -> tuple[Points, str, tuple[Path, 
         return points, str(sparse), (), notes
     note = f"{len(better):,} points are those of {sparse.name}/{ply.name}; the model itself has {len(points)}"
     return better, str(ply), (ply,), (*notes, note)
+
+
+def _mean_error(model: SparseModel) -> float | None:
+    """Mean reprojection error of the points, pixels; None where none is known."""
+    errors = model.points.errors
+    known = errors[np.isfinite(errors) & (errors >= 0)]
+    return float(known.mean()) if len(known) else None
 
 
 def _lists(sparse: Path) -> dict[Path, frozenset[str]]:

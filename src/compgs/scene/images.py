@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import TypeVar
@@ -15,6 +16,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from compgs.cameras import Camera
 from compgs.errors import ConfigError, SceneError, UnreadableImage, UnsupportedCamera
 from compgs.scene.capture import PosedImage
+from compgs.scene.headers import stops_in
 from compgs.scene.image_cache import ImageCache
 from compgs.scene.masks import mask_of, resized_mask, undistorted_mask
 from compgs.scene.pixels import REMEDY, UnusableSamples, has_alpha, is_wide, rgb
@@ -52,6 +54,15 @@ def stored_size(file: Path) -> tuple[tuple[int, int], bool]:
     try:
         with open_image(file) as image:
             return image.size, image.getexif().get(ORIENTATION) in SIDEWAYS
+    except DAMAGED as error:
+        raise UnreadableImage(_reason(file, error)) from error
+
+
+def stops_of(file: Path) -> float | None:
+    """Log2 of the light that the header says was let in (`headers`). Raises UnreadableImage."""
+    try:
+        with open_image(file) as image:
+            return stops_in(image.getexif())
     except DAMAGED as error:
         raise UnreadableImage(_reason(file, error)) from error
 
@@ -118,7 +129,8 @@ def load_views(
         camera, _ = undistorted(index)
         width, height = downscaled_size((camera.width, camera.height), downscale)
         stored = _Stored(cache, index, read)
-        return View(images[index].name, camera.resized(width, height), stored.image, stored.mask)
+        header = partial(stops_of, images[index].path)
+        return View(images[index].name, camera.resized(width, height), stored.image, stored.mask, header)
 
     views = _in_threads(view, len(images), None)
     fit = sum(3 * view.camera.width * view.camera.height for view in views) <= cache.most_bytes

@@ -23,6 +23,8 @@ class View:
     )  # [H, W, 3] uint8, display RGB, undistorted; or what reads them
     # [H, W] bool, True where a pixel counts (`scene/masks.py`), or what reads it; None: all count
     counted: np.ndarray | Callable[[], np.ndarray | None] | None = None
+    # what the header says of the light that was let in (`headers`), or what reads it; None: nothing
+    light: float | Callable[[], float | None] | None = None
 
     def __repr__(self) -> str:
         return f"View({self.name!r}, {self.camera.width} x {self.camera.height} pixels)"
@@ -40,6 +42,11 @@ class View:
     def mask(self) -> np.ndarray | None:
         """[H, W] bool, True where a pixel counts in training and in metrics; None: all. Raises UnreadableImage."""
         return self.counted() if callable(self.counted) else self.counted
+
+    @property
+    def stops(self) -> float | None:
+        """Log2 of the light that the header says was let in, or None: compares with views of one capture alone."""
+        return self.light() if callable(self.light) else self.light
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +75,7 @@ class Scene:
     extent: float  # world units: 1.1 x the largest distance of a camera from their mean (3DGS)
     source: Path  # the folder that was read
     notes: tuple[str, ...] = ()  # what was decided or replaced on loading, one sentence each
+    poses_in_doubt: str = ""  # why poses may be off by a pixel, in words; empty: nothing says so
     split: str = ""  # how the held-out views were chosen, in words; empty: not known, or none is held out
 
     def __repr__(self) -> str:

@@ -71,6 +71,7 @@ class Start:
     pixels: int  # of the largest training photograph
     device: str  # "cpu" or "cuda"
     processes: int = 1  # of a torchrun
+    poses_in_doubt: bool = False  # that they are right to a pixel
 
     @property
     def fewness(self) -> float:
@@ -268,6 +269,12 @@ RULES: tuple[Rule, ...] = (
         lambda s: s.device == "cpu" and s.processes == 1,
         "results/decisions.md",
     ),
+    Rule(
+        "poses", "poses", lambda c, s, learned: c.training.learns_poses(in_doubt=True),
+        "the reconstruction's mean error is above a pixel, or photographs are frames of a video",
+        lambda s: s.poses_in_doubt,
+        "results/hasty_captures.md",
+    ),
 )  # fmt: skip
 
 
@@ -300,6 +307,7 @@ class Plan:
     reasons: Mapping[str, str] = field(default_factory=dict)  # by field, of those that a rule has set
     # of the photographs, between two points that are found in them before the run (`compgs.stereo`); 0: none are
     dense_points: float = 0.0
+    poses: bool = False  # of the training views are learned beside the scene
 
     def model(self, settings: ModelConfig) -> ModelConfig:
         """The settings of the model, with what the plan has decided in their place."""
@@ -456,6 +464,7 @@ def _by_settings(config: Config, start: Start) -> dict[str, Any]:
         "sampled_gradients": 0.0,
         "passed_over": 0.0,
         "dense_points": 0.0,
+        "poses": config.training.poses == "on",
     }
 
 
@@ -498,4 +507,5 @@ def _expected(plan: Plan) -> dict[str, tuple[bool, str]]:
         "sampled_gradients": number("sampled_gradients", 100.0),
         "passed_over": number("passed_over", 1.0),
         "dense_points": number("dense_points", 1e4),
+        "poses": one_of("poses", True, False),
     }

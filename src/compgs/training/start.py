@@ -40,6 +40,7 @@ def start_of(scene: Scene, config: Config, device: torch.device, anchors: int) -
         pixels=max((camera.width * camera.height for camera in cameras), default=0),
         device=device.type,
         processes=world(),
+        poses_in_doubt=bool(scene.poses_in_doubt),
     )
 
 

@@ -61,6 +61,8 @@ class Trainer(SceneTrainer):
         self.model = self.trained = model
         scene = self.scene = local_scene(scene, model.world_offset)
         plan = self.plan = plan_of(model, scene, device)
+        if plan.poses:
+            self.views.learn_poses()
         self.settings = RasterSettings(background=scene.background, angular_dilation=model.angular_dilation)
         self.survey = Survey(model, scene, self.settings, lambda: self.step)
         self.optimizer = make_optimizer(model, t)

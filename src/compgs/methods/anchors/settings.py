@@ -29,6 +29,8 @@ ANCHOR_SETTINGS = (
     "training.schedule",
     "training.phases",
     "training.exposure",
+    "training.poses",
+    "training.robust",
 )
 
 

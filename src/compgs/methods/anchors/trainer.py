@@ -74,6 +74,8 @@ class AnchorTrainer(SceneTrainer):
                 f"{t.views_per_step}: start it without torchrun, and without training.views_per_step"
             )
         super().__init__(scene, config, device, method)
+        if t.learns_poses(in_doubt=bool(scene.poses_in_doubt)):
+            self.views.learn_poses()
         self.model = self.trained = (model or initial_anchors(self.kind_of_model, scene, config)).to(device)
         self.scene = local_scene(scene, self.model.frame.world_offset)
         groups = [{"name": n, "params": p, "lr": r[0], "rates": r} for n, (p, r) in self.groups().items()]
@@ -111,7 +113,9 @@ class AnchorTrainer(SceneTrainer):
             self.finish_step()
             return nothing_shown(photograph, self.scene.background, self.device)
         prediction = self.predict(values.rows(rows), camera)
-        rendered = self.pictures.rasterize(prediction.gaussians, camera, watched=self.watched)
+        posed = self.views.posed(index, prediction.gaussians, camera)
+        rendered = self.pictures.rasterize(posed, camera, watched=self.watched)
+        photograph = self.views.trusted(index, rendered.image, photograph)
         loss = self.pictures.compare(rendered, photograph) + self.regularize(prediction, camera)
         added = self.added()
         loss = loss if added is None else loss + added

@@ -62,7 +62,7 @@ class SceneTrainer(ABC):
         self.config = config
         self.device = device
         self.method = method
-        self.views = ViewsInTurn(scene, device, t.seed + 2, exposure=t.exposure, per_step=t.views_per_step)
+        self.views = ViewsInTurn(scene, device, t.seed + 2, t)
         self.chance = torch.Generator(device).manual_seed(t.seed + 1)  # of growth
         self.step = 0
 
@@ -100,12 +100,12 @@ class SceneTrainer(ABC):
         """Adam's step after these views. Gradients are summed over the ranks, and so is the `loss` [], which becomes
         that of all views.
         """
-        exposures = self.views.exposure_gradients(views)
-        sum_gradients(parameters_of(self.optimizer), loss, *exposures)
+        of_views = self.views.gradients(views)
+        sum_gradients(parameters_of(self.optimizer), loss, *of_views)
         self.set_learning_rates()
         self.move()
         self.optimizer.zero_grad(set_to_none=True)
-        self.views.learn(self.progress, views, exposures)
+        self.views.learn(self.progress, views, of_views)
 
     def set_learning_rates(self) -> None:
         """Give each group of parameters its learning rate of this step."""

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.losses import Target, exposed
+from compgs.losses import Target, as_taken
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class TrainingStatus:
 def training_psnr(result: StepResult) -> float:
     """PSNR in dB of the view that a step looked at, over the pixels that count."""
     photograph, counted = result.photograph.image.to(result.image.dtype) / 255.0, result.photograph.counted
-    image = exposed(result.image, result.photograph.exposure).detach()
+    image = as_taken(result.image, result.photograph).detach()
     squares = (image.clamp(0, 1) - photograph) ** 2
     error = float((squares if counted is None else squares[counted]).mean())
     return -10.0 * float(np.log10(max(error, 1e-10)))

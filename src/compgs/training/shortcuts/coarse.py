@@ -61,14 +61,14 @@ class CoarseViews:
         return halved(camera, halvings(progress, self.until, camera.width, camera.height))
 
     def look(self, view: int, camera: Camera, progress: float) -> tuple[Camera, Target]:
-        """Return camera and target at a `progress` of the run, 0 to 1; the target has the view's exposure where
-        exposures are learned.
+        """Return camera and target at a `progress` of the run, 0 to 1; the target knows its camera where photometry is
+        learned.
         """
         times = halvings(progress, self.until, camera.width, camera.height)
         if times == 0:
             return camera, self.views.photograph(view)
         small, target = self._halved(view, camera, times)
-        return small, self.views.with_exposure(view, target)
+        return small, self.views.with_camera(view, target)
 
     def _halved(self, view: int, camera: Camera, times: int) -> tuple[Camera, Target]:
         kept, key = self.kept, (view, times)

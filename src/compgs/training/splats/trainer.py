@@ -90,6 +90,8 @@ class SplatTrainer(SceneTrainer):
     ) -> None:
         super().__init__(scene, config, device, method)
         t = config.training
+        if t.learns_poses(in_doubt=bool(scene.poses_in_doubt)):
+            self.views.learn_poses()
         self.world_offset = world_offset(scene) if start is None else start.world_offset
         scene = self.scene = local_scene(scene, self.world_offset)
         self.phase = phase
@@ -160,7 +162,9 @@ class SplatTrainer(SceneTrainer):
         camera, photograph = self.hooks.view(self.scene.train_views[index].camera, photograph, self)
         splats = self.hooks.transform(self.parameters.splats(), self)
         gaussians = self.activate(splats, self.inside(splats, camera), camera)
-        rendered = self.pictures.rasterize(gaussians, camera, watched=self.watched)
+        posed = self.views.posed(index, gaussians, camera)
+        rendered = self.pictures.rasterize(posed, camera, watched=self.watched)
+        photograph = self.views.trusted(index, rendered.image, photograph)
         return Drawn(camera, photograph, splats, gaussians, rendered)
 
     def inside(self, splats: Splats, camera: Camera) -> Tensor:

@@ -9,6 +9,9 @@
 | `view_gradients` | what the step learns from its views |
 | `pictures` | a view drawn, compared with its photograph, and led back; the same for all trainers |
 | `dropout` | primitives that a step does without |
-| `exposures` | affine changes of color, one for each photograph |
+| `photometry`, `photometry_start` | exposure and color of each photograph, vignetting and response of each lens |
+| `poses` | a small turn and shift of each photograph's camera |
+| `robust` | what of the photographs is left out, as it moves |
+| `learned_rows` | how numbers of each photograph are learned |
 | `profiled` | what a profile calls the parts of the step |
 """

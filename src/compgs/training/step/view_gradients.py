@@ -1,4 +1,4 @@
-"""Gradients of a step's views by the latents that they are predicted from, the heads and the exposures.
+"""Gradients of a step's views by the latents that they are predicted from, the heads and what is learned of the views.
 
 latents ──predict──► Gaussians ──rasterize──► image ──compare, + volume──► loss ──► gradients
 """
@@ -75,7 +75,7 @@ class ViewGradients:
     def learn_from(
         self, shown: Quantized, geometry: Geometry | None, views: StepViews, number: int, now: Moment
     ) -> StepResult:
-        """Compute the gradients of one of the views by the latents, the heads and its exposure."""
+        """Compute the gradients of one of the views by the latents, the heads and what is learned of it."""
         view, part = views.views[number], views.own.part_of(number)
         camera, photograph = self.coarse.look(view, self.scene.train_views[view].camera, now.progress)
         rows = views.own.rows_of(number)
@@ -85,7 +85,11 @@ class ViewGradients:
         prediction, gaussians = self.predict(
             shown.of(part), rows, camera, now, views.noise_of_view(number), geometry, sizes
         )
-        rendered = self.pictures.rasterize(gaussians, camera, watched=now.watched)
+        learned = self.coarse.views
+        rendered = self.pictures.rasterize(
+            learned.posed(view, gaussians, camera), camera, watched=now.watched
+        )
+        photograph = learned.trusted(view, rendered.image, photograph)
         loss = self.pictures.compare(rendered, photograph) + self.regularize(prediction, gaussians, camera)
         self.pictures.backward(loss, rendered, gaussians)
         self.observe(rows, prediction, rendered, camera, now)

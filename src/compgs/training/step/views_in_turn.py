@@ -6,6 +6,7 @@ the others. Lanes do not depend on how many ranks there are. Where they are not 
 ones come a little more often.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,11 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from compgs.cameras import Camera
+from compgs.config import TrainingConfig
 from compgs.errors import ConfigError
+from compgs.gaussians import Gaussians
 from compgs.losses import Target
 from compgs.scene.views import Scene, View
-from compgs.training.run.distributed import world
-from compgs.training.step.exposures import Exposures
+from compgs.training.run.distributed import share_of_rank, world
+from compgs.training.step.photometry import Photometry
+from compgs.training.step.poses import Poses
+from compgs.training.step.robust import Robust
 
 KEPT_BYTES = 8 << 30  # of photographs on a GPU, 3 bytes a pixel
 
@@ -27,13 +33,15 @@ class ViewsInTurn:
     """Which view comes next. The order is random and belongs to the state of a run."""
 
     def __init__(
-        self, scene: Scene, device: torch.device, seed: int, *, exposure: bool = False, per_step: int = 1
+        self, scene: Scene, device: torch.device, seed: int, settings: TrainingConfig | None = None
     ) -> None:
-        """`exposure`: learn one for each view; `per_step`: views of a step, of all ranks.
+        """`settings`: how many views a step has, and what is learned of each beside the scene; None: one, and nothing.
 
         Raises ConfigError for a scene without training views, or with fewer than a step needs, and for a step of fewer
         views than there are ranks.
         """
+        settings = settings or TrainingConfig()
+        per_step = settings.views_per_step
         if not scene.train_views:
             raise ConfigError(f"{scene.name}: no training views are left after holding out the test views")
         if per_step > len(scene.train_views):
@@ -51,7 +59,12 @@ class ViewsInTurn:
         self.chance = np.random.default_rng(seed)
         self.order: list[int] = []  # the views still to come in this round of their lane, taken from the end
         self.photographs: dict[int, Target] = {}  # on a GPU
-        self.exposures = Exposures(len(self.views), device) if exposure else None
+        lanes = set(share_of_rank(range(per_step)))
+        own = [view for view in range(len(self.views)) if view % per_step in lanes]
+        self.photometry = Photometry(scene, device, own) if settings.exposure else None
+        self.robust = Robust(len(self.views), device) if settings.robust else None
+        self.poses: Poses | None = None
+        self._scene = scene
 
     def __len__(self) -> int:
         return len(self.views)
@@ -69,23 +82,41 @@ class ViewsInTurn:
         return self.order.pop()
 
     def photograph(self, index: int) -> Target:
-        """What to compare a rendering of a view with, at the exposure of the view where exposures are learned."""
-        return self.with_exposure(index, self.stored(index))
+        """What to compare a rendering of a view with; it knows its camera where photometry is learned."""
+        return self.with_camera(index, self.stored(index))
 
-    def with_exposure(self, index: int, target: Target) -> Target:
-        """What a view is compared with, at its exposure where exposures are learned."""
-        return target if self.exposures is None else replace(target, exposure=self.exposures.of(index))
+    def with_camera(self, index: int, target: Target) -> Target:
+        """What a view is compared with, and what its camera made of the scene where that is learned."""
+        return target if self.photometry is None else replace(target, taken=self.photometry.taken(index))
 
-    def exposure_gradients(self, views: Sequence[int]) -> tuple[Tensor, ...]:
-        """Return the exposures' gradients of a step's views, as far as this rank rendered them, the others 0: to be
+    def learn_poses(self) -> None:
+        """Learn from now on where each view was taken from."""
+        self.poses = Poses(self._scene, self.device)
+
+    def posed(self, index: int, gaussians: Gaussians[Tensor], camera: Camera) -> Gaussians[Tensor]:
+        """What the given camera of a view has to draw for the view to be seen from its learned pose."""
+        return gaussians if self.poses is None else self.poses.moved(index, gaussians, camera)
+
+    def trusted(self, index: int, image: Tensor, target: Target) -> Target:
+        """What a rendering of a view is compared with, without what moves, where a training is robust."""
+        return target if self.robust is None else self.robust.trusted(index, image, target)
+
+    @property
+    def learned(self) -> list[Photometry | Poses | Robust]:
+        """What is learned of the views beside the scene."""
+        return [part for part in (self.photometry, self.poses, self.robust) if part is not None]
+
+    def gradients(self, views: Sequence[int]) -> tuple[Tensor, ...]:
+        """Return gradients of what is learned of a step's views, as far as this rank rendered them, the others 0: to be
         summed over the ranks.
         """
-        return () if self.exposures is None else (self.exposures.gradients(views),)
+        return tuple(gradient for part in self.learned for gradient in part.gradients(views))
 
     def learn(self, progress: float, views: Sequence[int], gradients: Sequence[Tensor]) -> None:
-        """The exposures of a step's views, from `exposure_gradients`; `progress` of the run, 0 to 1."""
-        if self.exposures is not None:
-            self.exposures.learn(progress, views, gradients[0])
+        """Learn what belongs to a step's views, from `gradients`; `progress` of the run, 0 to 1."""
+        following = iter(gradients)
+        for part in self.learned:
+            part.learn(progress, views, tuple(itertools.islice(following, part.GRADIENTS)))
 
     def stored(self, index: int) -> Target:
         """Return a view's photograph. On the CPU it shares the memory of the view's image, which the scene keeps or
@@ -111,12 +142,12 @@ class ViewsInTurn:
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors that a checkpoint holds."""
-        return {} if self.exposures is None else self.exposures.tensors()
+        return {name: value for part in self.learned for name, value in part.tensors().items()}
 
     def restore(self, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
         """Go on from `tensors` and a `state`. Raises ValueError and the like for what is none."""
-        if self.exposures is not None:
-            self.exposures.restore(tensors)
+        for part in self.learned:
+            part.restore(tensors)
         self.chance.bit_generator.state = state["shuffle"]
         order = state["order"]
         if len(set(order)) != len(order) or not set(order) <= set(range(len(self.views))):

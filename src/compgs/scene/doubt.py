@@ -1,0 +1,33 @@
+"""Whether a capture's poses may be off by a pixel: what the reconstruction says of itself."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from compgs.scene.capture import Capture
+from compgs.scene.views import View
+
+REPORT = "reconstruction.json"  # of `compgs reconstruct`, in the scene's folder
+MOST_ERROR = 1.0  # pixels of the photographs as they are read
+
+
+def poses_in_doubt(folder: Path, capture: Capture, views: Sequence[View]) -> str:
+    """Why poses may be off by a pixel of the views, in words; empty where nothing says so."""
+    if _of_a_video(folder / REPORT):
+        return "the photographs are frames of a video"
+    if capture.reprojection_error is None:
+        return ""
+    there = np.median([posed.camera.fx for posed in capture.images])
+    here = np.median([view.camera.fx for view in views])
+    error = capture.reprojection_error * float(here / there)
+    return f"the reconstruction's mean error is {error:.1f} pixels" if error > MOST_ERROR else ""
+
+
+def _of_a_video(report: Path) -> bool:
+    try:
+        told = json.loads(report.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(told, dict) and told.get("video") is True

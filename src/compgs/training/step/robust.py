@@ -1,0 +1,116 @@
+"""Which parts of photographs a training leaves out: what the scene keeps failing to show, as it was there only once.
+
+Somebody who walks through a capture is in one photograph and not in its neighbours. No scene fits both, and one that is
+made to tries with mist. What differs there stays large, look after look, while the difference of what stands still
+falls. So each photograph has a grid of cells with the mean difference of the last looks. A cell that differs far more
+than most cells of all photographs do not count, nor do their pixels. A cell that was left out wrongly comes back: other
+photographs go on to teach the scene what is there, and the difference falls.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from compgs.losses import Target, as_taken
+from compgs.training.run.restoring import check_tensor
+
+GRID = 48  # cells along each side of a photograph
+KEPT = 0.6  # of a cell's mean difference, from one look to the next
+FROM = 0.1  # of the run: before, everything differs
+FAR_MORE = 6.0  # times the median of all cells
+LEAST = 0.1  # of 0 to 1: a smaller difference is never left out
+
+
+class Robust:
+    """The difference of each training view's cells, and what it says about the next look at them."""
+
+    GRADIENTS = 1  # tensors of `gradients`
+
+    def __init__(self, views: int, device: torch.device) -> None:
+        self.differences = torch.zeros(views, GRID, GRID, device=device)
+        self.looks = torch.zeros(views, dtype=torch.int64)
+        self.progress = 0.0
+        self._seen: dict[int, Tensor] = {}
+
+    @torch.no_grad()
+    def trusted(self, view: int, image: Tensor, target: Target) -> Target:
+        """The target without what has differed too much so far; remembers how much it does now."""
+        photograph = target.image.to(image.dtype)
+        if target.image.dtype == torch.uint8:
+            photograph = photograph / 255.0
+        difference = (as_taken(image.detach(), target) - photograph).abs().mean(2)
+        self._seen[view] = cells(difference, target.counted)
+        if self.progress < FROM or self.looks[view] == 0:
+            return target
+        left_out = pixels(smooth(self.differences[view]) > self.limit(), *difference.shape)
+        counted = ~left_out if target.counted is None else target.counted & ~left_out
+        return replace(target, counted=counted) if left_out.any() and counted.any() else target
+
+    def limit(self) -> float:
+        """Difference from which on a cell is left out."""
+        looked_at = self.differences[self.looks > 0]
+        return max(LEAST, FAR_MORE * float(looked_at.median())) if len(looked_at) else LEAST
+
+    @torch.no_grad()
+    def gradients(self, views: Sequence[int]) -> tuple[Tensor, ...]:
+        """[V, cells + 1]: differences of this step's looks, and whether there was one; to be summed over the ranks."""
+        found = self.differences.new_zeros(len(views), GRID * GRID + 1)
+        for row, view in zip(found, views, strict=True):
+            if view in self._seen:
+                row[:-1], row[-1] = self._seen[view].view(-1), 1.0
+        self._seen.clear()
+        return (found,)
+
+    @torch.no_grad()
+    def learn(self, progress: float, views: Sequence[int], gradients: Sequence[Tensor]) -> None:
+        """Remember the looks of a step; `progress` of the run, 0 to 1."""
+        self.progress = progress
+        for view, row, there in zip(views, gradients[0], gradients[0][:, -1].tolist(), strict=True):
+            if there:
+                now, first = row[:-1].view(GRID, GRID), self.looks[view] == 0
+                self.differences[view] = now if first else self.differences[view].lerp(now, 1 - KEPT)
+                self.looks[view] += 1
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors that a checkpoint holds."""
+        progress = torch.tensor(self.progress, dtype=torch.float64)
+        return {
+            "robust/differences": self.differences,
+            "robust/looks": self.looks,
+            "robust/progress": progress,
+        }
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Inverse of `tensors`. Raises ValueError, KeyError for what is none."""
+        for name, value in self.tensors().items():
+            check_tensor(tensors[name], value.shape, value.dtype, name)
+        self.differences.copy_(tensors["robust/differences"])
+        self.looks.copy_(tensors["robust/looks"])
+        self.progress = float(tensors["robust/progress"])
+
+
+def cells(difference: Tensor, counted: Tensor | None) -> Tensor:
+    """[H, W] of pixels -> [GRID, GRID] means over those that count; 0 where none does."""
+    if counted is None:
+        return pooled(difference)
+    share = pooled(counted.to(difference.dtype))
+    return pooled(difference * counted) / share.clamp_min(1e-6)
+
+
+def pooled(values: Tensor) -> Tensor:
+    """[H, W] -> [GRID, GRID] means."""
+    return nn.functional.adaptive_avg_pool2d(values[None, None], GRID)[0, 0]
+
+
+def smooth(values: Tensor) -> Tensor:
+    """[GRID, GRID] means over each cell and those around it: what moves is seldom as small as a cell."""
+    return nn.functional.avg_pool2d(values[None, None], 3, stride=1, padding=1, count_include_pad=False)[0, 0]
+
+
+def pixels(chosen: Tensor, height: int, width: int) -> Tensor:
+    """[GRID, GRID] bool -> [height, width] bool: the pixels of the chosen cells."""
+    rows = torch.arange(height, device=chosen.device) * GRID // height
+    columns = torch.arange(width, device=chosen.device) * GRID // width
+    return chosen[rows][:, columns]
