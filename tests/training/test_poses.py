@@ -10,7 +10,7 @@ from compgs.gaussians import Gaussians
 from compgs.scene.views import Scene
 from compgs.tensors.rasterize import rasterize
 from compgs.training.splats.trainer import SplatTrainer
-from compgs.training.step.poses import Poses, moved, rotation_matrix
+from compgs.training.step.poses import Poses, moved, rates, rotation_matrix
 from compgs.training.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -37,7 +37,7 @@ def double(blobs: Gaussians) -> Gaussians:
 
 
 def test_primitives_that_are_moved_look_like_a_camera_that_is_moved(blob_scene, blobs) -> None:
-    poses = Poses(blob_scene, CPU)
+    poses = Poses(blob_scene, CPU, looks=50)
     poses.rows.numbers[2] = torch.tensor([1.0, -2.0, 0.5, 3.0, -1.0, 2.0])
     camera = blob_scene.train_views[2].camera
     scene = double(replace(blobs, scales=blobs.scales * torch.tensor([1.0, 0.4, 2.0])))
@@ -66,7 +66,7 @@ def test_the_gradient_of_an_offset_is_that_of_finite_differences(blob_scene, blo
 
 
 def test_all_together_cameras_neither_turn_nor_move_nor_spread(blob_scene) -> None:
-    poses = Poses(blob_scene, CPU)
+    poses = Poses(blob_scene, CPU, looks=50)
     numbers = torch.from_numpy(np.random.default_rng(0).normal(size=(8, 6))).float()
     poses.rows.numbers[:] = numbers
     poses.hold_means()
@@ -78,6 +78,12 @@ def test_all_together_cameras_neither_turn_nor_move_nor_spread(blob_scene) -> No
     before = values.clone()
     poses.hold_means()
     torch.testing.assert_close(values, before)
+
+
+def test_the_fewer_looks_a_run_has_the_more_each_of_them_moves_a_camera() -> None:
+    firsts = [rates(looks)[0] for looks in (5, 20, 50, 100, 300, 1000)]
+    assert firsts == sorted(firsts, reverse=True) and firsts[0] == 0.3 and firsts[-1] == 0.05
+    assert rates(60)[0] == pytest.approx(0.1) and rates(60)[1] == pytest.approx(0.01)
 
 
 def off(scene: Scene, truth: Scene, poses: Poses | None) -> float:

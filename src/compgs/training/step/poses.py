@@ -23,7 +23,9 @@ from compgs.scene.sight import depths_in
 from compgs.scene.views import Scene
 from compgs.training.step.learned_rows import LearnedRows
 
-LEARNING_RATES = (0.1, 0.01)  # pixels a step on a view, first and last of a run
+FIRST_RATES = (0.05, 0.3)  # pixels a step on a view, at the beginning of long and short runs
+FIRST_OF_LOOKS = 6.0  # pixels: the first rate, times the looks that a run has at each view
+LAST_RATE = 0.1  # times the first
 TURN, SHIFT = slice(0, 3), slice(3, 6)
 LOOKED_AT = 16  # cameras by which the distance of what they show is found
 
@@ -33,11 +35,12 @@ class Poses:
 
     GRADIENTS = 1  # tensors of `gradients`
 
-    def __init__(self, scene: Scene, device: torch.device) -> None:
+    def __init__(self, scene: Scene, device: torch.device, looks: float) -> None:
+        """`looks`: how often a run looks at each view; with few looks, each has to move more."""
         cameras = [view.camera for view in scene.train_views]
         focal = float(np.median([camera.fx for camera in cameras]))
         turn, shift = 1.0 / focal, usual_depth(scene) / focal
-        self.rows = LearnedRows("poses", len(cameras), [turn] * 3 + [shift] * 3, device, LEARNING_RATES)
+        self.rows = LearnedRows("poses", len(cameras), [turn] * 3 + [shift] * 3, device, rates(looks))
         centers = np.stack([camera.center for camera in cameras])
         spread = torch.from_numpy(centers - centers.mean(axis=0)).float().to(device)
         self.spread = spread / spread.norm().clamp_min(1e-30)
@@ -78,6 +81,13 @@ class Poses:
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Inverse of `tensors`. Raises ValueError, KeyError for what is none."""
         self.rows.restore(tensors)
+
+
+def rates(looks: float) -> tuple[float, float]:
+    """Pixels a step on a view, first and last of a run that looks at each so often."""
+    least, most = FIRST_RATES
+    first = min(most, max(least, FIRST_OF_LOOKS / max(looks, 1.0)))
+    return first, LAST_RATE * first
 
 
 def moved(gaussians: Gaussians[Tensor], offset: Tensor, camera: Camera) -> Gaussians[Tensor]:

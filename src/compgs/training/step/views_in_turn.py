@@ -65,6 +65,7 @@ class ViewsInTurn:
         self.robust = Robust(len(self.views), device) if settings.robust else None
         self.poses: Poses | None = None
         self._scene = scene
+        self._looks = settings.steps * per_step / len(self.views)
 
     def __len__(self) -> int:
         return len(self.views)
@@ -91,7 +92,7 @@ class ViewsInTurn:
 
     def learn_poses(self) -> None:
         """Learn from now on where each view was taken from."""
-        self.poses = Poses(self._scene, self.device)
+        self.poses = Poses(self._scene, self.device, self._looks)
 
     def posed(self, index: int, gaussians: Gaussians[Tensor], camera: Camera) -> Gaussians[Tensor]:
         """What the given camera of a view has to draw for the view to be seen from its learned pose."""
