@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from compgs.config import Config, ControlConfig, Phases, SplatConfig
+from compgs.config import Config, ControlConfig, Phases, SplatConfig, TrainingConfig
 from compgs.errors import ConfigError
 from compgs.scene.views import Scene
 from compgs.training.splats.densification import densify_schedule
