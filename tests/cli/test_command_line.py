@@ -25,7 +25,7 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
 
 def test_the_commands_are_there() -> None:
     assert NAMES == [
-        "reconstruct", "train", "compress", "encode", "decode", "render", "evaluate", "view", "compare", "report",
+        "reconstruct", "train", "tiles", "compress", "encode", "decode", "render", "evaluate", "view", "compare", "report",
         "benchmark", "export", "serve", "info", "demo-scene",
     ]  # fmt: skip
 
