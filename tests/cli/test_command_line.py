@@ -25,8 +25,8 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
 
 def test_the_commands_are_there() -> None:
     assert NAMES == [
-        "reconstruct", "train", "tiles", "compress", "encode", "decode", "render", "evaluate", "view", "compare", "report",
-        "benchmark", "export", "serve", "info", "demo-scene",
+        "reconstruct", "train", "tiles", "compress", "encode", "decode", "render", "evaluate", "view", "compare",
+        "report", "benchmark", "export", "serve", "info", "demo-scene",
     ]  # fmt: skip
 
 

@@ -75,9 +75,8 @@ class Trainer(SceneTrainer):
         self.coarse = CoarseViews(self.views, plan.coarse_until)
         self.pictures = Pictures(self.settings, t.ssim_weight)
         self.latents = StepLatents(model, t.rate)
-        self.gradients = ViewGradients(
-            model, scene, t, plan, self.pictures, self.coarse, self.hidden, self.control
-        )
+        seen = self.pictures, self.coarse, self.hidden, self.control
+        self.gradients = ViewGradients(model, scene, t, plan, *seen)
         tools = self.optimizer, self.survey, self.control, self.chance
         self.structure = Structure(config, plan, model, *tools)
 
