@@ -59,7 +59,7 @@ def test_a_command_after_its_file_is_recognized(capsys: pytest.CaptureFixture[st
     [
         ("info", "usage: compgs info FILE|RUN [OPTIONS]"),
         ("train", "usage: compgs train SCENE -o RUN [OPTIONS]"),
-        ("render", "usage: compgs render FILE|RUN [SCENE] -o FOLDER|MP4|GIF [OPTIONS]"),
+        ("render", "usage: compgs render FILE|RUN [SCENE] -o FOLDER|MP4|WEBP|GIF [OPTIONS]"),
         ("serve", "usage: compgs serve [FOLDER] [OPTIONS]"),
         ("compress", "usage: compgs compress FILE -o OUT.cgs [OPTIONS]"),
     ],

@@ -74,8 +74,8 @@ MISTAKES = [
     (["train", "x", "-o", "r", "--seed", "2.5"], "--seed: expected a whole number, found '2.5'"),
     (["train", "x", "-o", "r", "--steps", "1e4"], "--steps: expected a whole number, found '1e4'"),
     (["train", "x", "-o", "r", "--lmbda=abc"], "--lmbda: expected a number, found 'abc'"),
-    (["render", "a.cgs"], "--output FOLDER|MP4|GIF is missing"),
-    (["render", "a.cgs", "-o"], "-o: expected a value (FOLDER|MP4|GIF), found none"),
+    (["render", "a.cgs"], "--output FOLDER|MP4|WEBP|GIF is missing"),
+    (["render", "a.cgs", "-o"], "-o: expected a value (FOLDER|MP4|WEBP|GIF), found none"),
     (["render", "a.cgs", "-o", "out", "--up", "0", "-1"], "--up: expected 3 values (X Y Z), found 0 -1"),
     (["info"], "FILE|RUN is missing"),
 ]

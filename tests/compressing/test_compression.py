@@ -186,7 +186,8 @@ def test_a_trial_takes_a_part_of_the_time_only(
 
     monkeypatch.setattr(pace.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(pace, "train", train)
-    monkeypatch.setattr(pace, "plan_for", lambda *_: None)
+    plan = SimpleNamespace(with_the_points_at_hand=lambda: None)
+    monkeypatch.setattr(pace, "plan_for", lambda *_: plan)
     assert pace.seconds_per_step(Views((0,)), config, "cpu", seconds) == 1.0
     assert clock[0] == steps
 

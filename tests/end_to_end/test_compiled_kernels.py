@@ -14,7 +14,7 @@ from pathlib import Path
 import compgs
 from compgs.cli.settings import with_settings
 from compgs.config import load_config
-from compgs.training.splats.trainer import train_splats
+from compgs.training.splats.phases import train_splats
 from compgs.formats.ply import write_ply
 
 scene = compgs.load_scene(sys.argv[1])

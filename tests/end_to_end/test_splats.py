@@ -25,7 +25,6 @@ OPTIONS = [
     str(STEPS),
     "--seed",
     "7",
-    "--set",
 ]
 
 

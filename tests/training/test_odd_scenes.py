@@ -308,9 +308,11 @@ def test_learning_rates_far_too_high_end_in_finite_values_or_in_an_error_that_sa
     config: Config, factor: float
 ) -> None:
     t = config.training
-    rates = {
-        name: tuple(min(99.0, factor * r) for r in v) for name, v in vars(t).items() if name.endswith("_lr")
-    }
+
+    def raised(rate: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        return tuple(map(raised, rate)) if isinstance(rate, tuple) else min(99.0, factor * rate)
+
+    rates = {name: raised(rate) for name, rate in vars(t).items() if name.endswith("_lr")}
     try:
         trained(portrait(), replace(config, training=replace(t, **rates)))
     except TrainingError as error:
