@@ -271,7 +271,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         "poses", "poses", lambda c, s, learned: c.training.learns_poses(in_doubt=True),
-        "the reconstruction's mean error is above a pixel, or photographs are frames of a video",
+        "a reconstruction whose mean error is above a pixel, or frames of a video",
         lambda s: s.poses_in_doubt,
         "results/hasty_captures.md",
     ),
