@@ -196,7 +196,7 @@ def test_a_time_is_kept_and_its_steps_are_written_down(
     monkeypatch: pytest.MonkeyPatch, ball_ply: Path, config: Config, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(pace, "FEWEST", 7)
-    begun = begin(ball_ply, tmp_path / "out.cgs", config, replace(LOOKING, views=3, held_out=1), seconds=0.5)
+    begun = begin(ball_ply, tmp_path / "out.cgs", config, replace(LOOKING, views=3, held_out=1), seconds=1e-3)
     assert begun.begun.config.training.steps == 7
     again = json.loads((folder_of(tmp_path / "out.cgs") / "compress.json").read_text())
     assert again["settings"]["training"]["steps"] == 7

@@ -48,7 +48,15 @@ def show(page: Page, file: Path) -> None:
 
 
 def at_rest(page: Page) -> None:
-    until(lambda: page.ask(IS_AT_REST), "rest")
+    """Wait until the camera rests, and still does a moment later: on a busy machine an event may be on its way."""
+
+    def rests() -> bool:
+        if not page.ask(IS_AT_REST):
+            return False
+        time.sleep(0.2)
+        return bool(page.ask(IS_AT_REST))
+
+    until(rests, "rest")
 
 
 def numbers(page: Page, expression: str) -> np.ndarray:
