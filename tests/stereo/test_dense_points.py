@@ -9,6 +9,7 @@ import torch
 
 from compgs.cameras import Camera
 from compgs.config import Config
+from compgs.numerics.evenly import evenly
 from compgs.scene import ray_tracing
 from compgs.scene.generated import camera_path, observe, still_life
 from compgs.scene.views import Points, Scene, View
@@ -16,7 +17,7 @@ from compgs.stereo import dense_points
 from compgs.stereo.fusion import Places, thinned
 from compgs.stereo.neighbours import neighbours_of, sight_of
 from compgs.training.plan import plan
-from compgs.training.start import initial_model, spread_evenly, start_of, with_dense_points
+from compgs.training.start import initial_model, start_of, with_dense_points
 
 CPU = torch.device("cpu")
 
@@ -127,12 +128,12 @@ def test_the_same_photographs_give_the_same_points_and_no_more_than_there_is_roo
     scene: Scene, found: Points
 ) -> None:
     more = with_dense_points(scene, 4.0, 100, CPU).points
-    added = spread_evenly(len(found), 100)
+    added = evenly(len(found), 100)
     np.testing.assert_array_equal(more.positions[len(scene.points) :], found.positions[added])
     np.testing.assert_array_equal(more.colors[len(scene.points) :], found.colors[added])
 
 
 def test_a_choice_of_few_is_spread_evenly() -> None:
-    assert spread_evenly(10, 4).tolist() == [0, 2, 5, 7]
-    assert spread_evenly(3, 9).tolist() == [0, 1, 2]
-    assert spread_evenly(3, -1).tolist() == []
+    assert evenly(10, 4) == [0, 2, 5, 7]
+    assert evenly(3, 9) == [0, 1, 2]
+    assert evenly(3, -1) == []

@@ -24,6 +24,7 @@ import { LiveScene, type Splats } from "../src/live/live_scene.ts";
 import type { SceneInfo } from "../src/scene_info.ts";
 import { type Source, isCgs } from "../src/sources.ts";
 import { NEAR, dilationOf } from "../viewer/splatting.ts";
+import type { ShownOptions } from "./options.ts";
 import { drawAsTrained, setDilation } from "./playcanvas_splatting.ts";
 import { startCamera } from "./viewpoint.ts";
 
@@ -60,16 +61,7 @@ function splatFormat(device: GraphicsDevice): GSplatFormat {
   );
 }
 
-export interface CgsOptions {
-  /** Bytes of the file so far and of all, the latter if it is known. */
-  onProgress?: (loaded: number, total: number | null) => void;
-  /** The resource shows a scene, or a finer one. */
-  onSplats?: (resource: CgsResource) => void;
-  /** Splats that are wanted: finer parts of the file that would be more are not fetched. By default `splatBudget()`. */
-  most?: number;
-  /** Of `compgs/worker`, for pages whose policy forbids workers from blobs. */
-  worker?: Worker;
-}
+export type CgsOptions = ShownOptions<CgsResource>;
 
 /**
  * Splats of a .cgs file: a resource of the component `gsplat`. Axes are the file's, as with the engine's own files; the

@@ -23,21 +23,13 @@ import { LiveScene, type Splats } from "../src/live/live_scene.ts";
 import type { SceneInfo } from "../src/scene_info.ts";
 import { type Source, isCgs } from "../src/sources.ts";
 import { CUTOFF, dilationOf } from "../viewer/splatting.ts";
+import type { ShownOptions } from "./options.ts";
 import { viewpointCamera, viewpointTarget } from "./three_view.ts";
 
 export { splatBudget } from "../src/budget.ts";
 export { isCgs, MEDIA_TYPE } from "../src/sources.ts";
 
-export interface CgsMeshOptions {
-  /** Bytes of the file so far and of all, the latter if it is known. */
-  onProgress?: (loaded: number, total: number | null) => void;
-  /** The mesh shows a scene, or a finer one. */
-  onSplats?: (mesh: CgsMesh) => void;
-  /** Splats that are wanted: finer parts of the file that would be more are not fetched. By default `splatBudget()`. */
-  most?: number;
-  /** Of `compgs/worker`, for pages whose policy forbids workers from blobs. */
-  worker?: Worker;
-}
+export type CgsMeshOptions = ShownOptions<CgsMesh>;
 
 /**
  * A SplatMesh of a .cgs file: coarse as soon as the first part of the file is there, then finer. Axes are the file's, as

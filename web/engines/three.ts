@@ -30,6 +30,7 @@ import type { SceneInfo } from "../src/scene_info.ts";
 import type { Source } from "../src/sources.ts";
 import { geometryPlanes, rowsOf } from "../viewer/splat_planes.ts";
 import { PLANES, ROW, dilationOf } from "../viewer/splatting.ts";
+import type { ShownOptions } from "./options.ts";
 import { FRAGMENT, VERTEX } from "./three_shaders.ts";
 import type { FromSorter, ToSorter } from "./three_sorter.ts";
 import { viewpointCamera, viewpointTarget } from "./three_view.ts";
@@ -37,15 +38,8 @@ import { viewpointCamera, viewpointTarget } from "./three_view.ts";
 export { splatBudget } from "../src/budget.ts";
 export { isCgs, MEDIA_TYPE } from "../src/sources.ts";
 
-export interface CgsSplatsOptions {
-  /** Bytes of the file so far and of all, the latter if it is known. */
-  onProgress?: (loaded: number, total: number | null) => void;
-  /** The mesh shows a scene, or a finer one. */
-  onSplats?: (splats: CgsSplats) => void;
-  /** Splats that are wanted: finer parts of the file that would be more are not fetched. By default `splatBudget()`. */
-  most?: number;
-  /** Of `compgs/worker` and of `compgs/sorter`, for pages whose policy forbids workers from blobs. */
-  worker?: Worker;
+export interface CgsSplatsOptions extends ShownOptions<CgsSplats> {
+  /** Of `compgs/sorter`, for pages whose policy forbids workers from blobs. */
   sorter?: Worker;
 }
 

@@ -1,6 +1,7 @@
 /** Splats as docs/bitstream_prediction.md, "Rendering", has them: one quad each, drawn from back to front. */
 
-import { CUTOFF, MARGIN, MOST_ALPHA, NEAR, ROW } from "./splatting.ts";
+import { BLENDED, ELLIPSE } from "./splat_glsl.ts";
+import { CUTOFF, NEAR, ROW } from "./splatting.ts";
 
 export const SPLAT_VERTEX = `#version 300 es
 precision highp float;
@@ -29,39 +30,12 @@ void main() {
   vec3 s0 = texelFetch(geometry, at + ivec2(0, planeRows), 0).xyz;
   vec3 s1 = texelFetch(geometry, at + ivec2(0, 2 * planeRows), 0).xyz;
   mat3 covariance = mat3(s0.x, s0.y, s0.z, s0.y, s1.x, s1.y, s0.z, s1.y, s1.z);
-  vec2 widened = ${MARGIN} * size / focal;
-  vec2 ratio = clamp(p.xy / p.z, -principal / focal - widened, (size - principal) / focal + widened);
-  vec3 row0 = vec3(focal.x / p.z, 0.0, -focal.x * ratio.x / p.z) * rotation;
-  vec3 row1 = vec3(0.0, focal.y / p.z, -focal.y * ratio.y / p.z) * rotation;
-  vec3 c0 = covariance * row0;
-  float a = dot(row0, c0) + dilation;
-  float b = dot(row1, c0);
-  float c = dot(row1, covariance * row1) + dilation;
-  // Principal axes of the ellipse.
-  float radius = length(vec2(0.5 * (a - c), b));
-  float largest = 0.5 * (a + c) + radius;
-  float smallest = max((a * c - b * b) / largest, dilation);  // never less, but a difference loses digits
-  vec2 axis = a >= c ? vec2(largest - c, b) : vec2(b, largest - a);
-  axis = radius > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
-  float reach = sqrt(2.0 * log(color.a / ${CUTOFF})) + 1e-3;  // where alpha falls below the cutoff
-  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
-  place = corner * reach;
-  vec2 pixel = focal * p.xy / p.z + principal
-    + place.x * sqrt(largest) * axis + place.y * sqrt(smallest) * vec2(-axis.y, axis.x);
-  vec2 clip = 2.0 * pixel / size - 1.0;
+  mat3 turn = rotation;
+${ELLIPSE}
   gl_Position = vec4(clip.x, -clip.y, 0.0, 1.0);
 }`;
 
-export const SPLAT_FRAGMENT = `#version 300 es
-precision highp float;
-in vec2 place;
-in vec4 color;
-out vec4 result;
-void main() {
-  float alpha = min(${MOST_ALPHA}, color.a * exp(-0.5 * dot(place, place)));
-  if (alpha < ${CUTOFF}) discard;
-  result = vec4(color.rgb * alpha, alpha);
-}`;
+export const SPLAT_FRAGMENT = `#version 300 es${BLENDED}`;
 
 export const SCREEN_VERTEX = `#version 300 es
 void main() {

@@ -12,6 +12,7 @@ import numpy as np
 
 from compgs.cameras import Camera
 from compgs.numerics.nearest import nearest
+from compgs.scene.sight import places_in
 from compgs.scene.views import Points
 
 ASKED = 10  # photographs that a pixel's place is looked up in, those taken nearest
@@ -71,13 +72,11 @@ def _confirmed(found: Depths, others: Sequence[Depths]) -> Places:
 def _agrees(other: Depths, positions: np.ndarray) -> np.ndarray:
     """[P] bool: whether a photograph has found the same distance where it shows positions [P, 3]."""
     camera = other.camera
-    x, y, z = (positions @ camera.rotation.T + camera.translation).T
-    ahead = z > 0
-    safe = np.where(ahead, z, 1.0)
-    column, row = np.floor(camera.fx * x / safe + camera.cx), np.floor(camera.fy * y / safe + camera.cy)
+    column, row, distance = places_in(camera, positions)
+    column, row, ahead = np.floor(column), np.floor(row), distance > 0
     inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     theirs = other.inverse[np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)]
-    return inside & (theirs > 0) & (np.abs(theirs - 1.0 / safe) < other.tolerance)
+    return inside & (theirs > 0) & (np.abs(theirs - 1.0 / np.where(ahead, distance, 1.0)) < other.tolerance)
 
 
 def thinned(places: Places, pixels: float, known: np.ndarray) -> Points:

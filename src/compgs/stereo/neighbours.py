@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compgs.cameras import Camera
+from compgs.scene.sight import depths_in
 
 NEIGHBOURS = 4
 # Distance of two cameras over that of what they see: about 7 degrees. Nearer ones tell distances apart badly, those
@@ -22,20 +23,16 @@ class Sight:
 
     seen: np.ndarray  # [P] bool
     nearest: float  # world units along the axis: the first hundredth of the distances
-    farthest: float  # all but the last two hundredth
+    farthest: float  # of all but the farthest half of a hundredth
     middle: float  # the median
 
 
 def sight_of(camera: Camera, points: np.ndarray) -> Sight | None:
     """What a camera sees of points [P, 3]; None if it is too little."""
-    x, y, z = (points @ camera.rotation.T + camera.translation).T
-    ahead = z > 0
-    safe = np.where(ahead, z, 1.0)
-    column, row = camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy
-    seen = ahead & (column > 0) & (column < camera.width) & (row > 0) & (row < camera.height)
+    depths, seen = depths_in(camera, points)
     if seen.sum() < FEWEST_SEEN:
         return None
-    nearest, middle, farthest = np.percentile(z[seen], (1.0, 50.0, 99.5))
+    nearest, middle, farthest = np.percentile(depths[seen], (1.0, 50.0, 99.5))
     return Sight(seen, float(nearest), float(farthest), float(middle))
 
 

@@ -10,6 +10,7 @@ from compgs.cameras import Camera
 from compgs.codec.format import LARGEST_DILATION, SMALLEST_DILATION
 from compgs.config import MAX_VIEWPOINTS, Config, ModelConfig
 from compgs.errors import ConfigError
+from compgs.numerics.evenly import evenly
 from compgs.numerics.nearest import nearest
 from compgs.progress import shown_count
 from compgs.render.settings import as_angle
@@ -117,16 +118,10 @@ def with_dense_points(scene: Scene, pixels: float, most: int, device: torch.devi
     """
     with shown_count(None, "looking for points, photographs") as progress:
         found = dense_points(scene, pixels, device, progress)
-    kept = spread_evenly(len(found), most)
+    kept = evenly(len(found), most)
     known = scene.points
     positions = np.concatenate([known.positions, found.positions[kept].astype(known.positions.dtype)])
     return replace(scene, points=Points(positions, np.concatenate([known.colors, found.colors[kept]])))
-
-
-def spread_evenly(count: int, most: int) -> np.ndarray:
-    """Indices of at most so many of `count` things, evenly spread."""
-    chosen = max(0, min(count, most))
-    return np.arange(chosen) * count // max(1, chosen)
 
 
 def angular_dilation(pixels: float, cameras: Sequence[Camera]) -> float:

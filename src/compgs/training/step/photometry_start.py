@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from compgs.scene.sight import depths_in
+from compgs.scene.sight import depths_in, places_in
 from compgs.scene.views import Scene, View
 from compgs.training.run.distributed import sum_over_ranks
 
@@ -57,10 +57,9 @@ def gains_by_points(scene: Scene, own: Sequence[int]) -> np.ndarray | None:
 def _against_points(view: View, positions: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, float] | None:
     """[3] log2 of the view's colors over the points', median, and how alike the two are; None: too few are shown."""
     camera, image = view.camera, view.image
-    depth, shown = depths_in(camera, positions)
-    inside = positions[shown] @ camera.rotation.T + camera.translation
-    column = (camera.fx * inside[:, 0] / depth[shown] + camera.cx).astype(np.int64)
-    row = (camera.fy * inside[:, 1] / depth[shown] + camera.cy).astype(np.int64)
+    shown = depths_in(camera, positions)[1]
+    columns, rows, _ = places_in(camera, positions[shown])
+    column, row = columns.astype(np.int64), rows.astype(np.int64)
     column, row = column.clip(0, camera.width - 1), row.clip(0, camera.height - 1)
     there, known = image[row, column].astype(np.float64), colors[shown].astype(np.float64)
     useful = ((there > DARK) & (there < BRIGHT) & (known > DARK) & (known < BRIGHT)).all(axis=1)

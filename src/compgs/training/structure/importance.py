@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from compgs.cameras import Camera
+from compgs.numerics.evenly import evenly
 from compgs.render import RasterSettings
 from compgs.scene.views import View
 from compgs.tensors.contributions import contributions
@@ -19,9 +20,7 @@ from compgs.tensors.prediction import Prediction
 
 def spread(views: Sequence[View], most: int) -> Sequence[View]:
     """Choose at most `most` of the views, evenly spread over their order."""
-    if len(views) <= most:
-        return views
-    return [views[i * len(views) // most] for i in range(most)]
+    return [views[i] for i in evenly(len(views), most)]
 
 
 @torch.no_grad()
