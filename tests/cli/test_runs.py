@@ -81,6 +81,16 @@ def test_a_run_and_its_file_are_evaluated_as_it_was_trained(
         assert results(tmp_path / name)["notes"] == []
 
 
+def test_results_as_json_are_those_of_the_folder_and_alone_on_standard_output(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, run: Path
+) -> None:
+    assert main(["evaluate", str(run), "--json", "-o", str(tmp_path / "out")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    views = found.pop("per_view")
+    assert found == results(tmp_path / "out")
+    assert views == json.loads((tmp_path / "out" / "per_view.json").read_text())
+
+
 def test_options_go_before_the_settings_of_the_run_and_what_differs_is_said(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, run: Path
 ) -> None:
