@@ -8,5 +8,5 @@
 | `crew` | shares a kernel's work among threads |
 | `products`, `vector_sums` | small matrix products and sums, in kernels |
 | `ssim` | structural similarity with its gradient, on the CPU |
-| `rotations`, `nearest` | quaternions, and nearest neighbours |
+| `rotations`, `nearest`, `evenly` | quaternions, nearest neighbours, and a few of many, evenly spread |
 """
