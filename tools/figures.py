@@ -111,7 +111,7 @@ def titled(record: Record, link: str) -> str:
 def captures(folder: str) -> str:
     """A row for each record, in a few columns. `folder` leads from the page to docs/results."""
     lines = [
-        "| capture | training views | steps | training | PSNR | SSIM | file |",
+        "| capture | photographs, pixels | steps | training | PSNR | SSIM | file |",
         "|---|---|---|---|---|---|---|",
     ]
     for record in records():
@@ -222,9 +222,8 @@ def components(name: str) -> str:
 
 
 def views(record: Record) -> str:
-    return (
-        f"{record['plan']['start']['views']} of {record['results']['width']} x {record['results']['height']}"
-    )
+    results = record["results"]
+    return f"{record['plan']['start']['views']} at {results['width']} x {results['height']}"
 
 
 def minutes(record: Record) -> str:

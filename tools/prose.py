@@ -1,4 +1,4 @@
-"""Lists sentences of README.md and docs/*.md that have to be read twice.
+"""Lists sentences of README.md and the pages of docs/ that have to be read twice.
 
     python tools/prose.py                      # counts, by page
     python tools/prose.py docs/tiles.md        # the sentences of these pages
