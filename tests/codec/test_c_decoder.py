@@ -65,8 +65,15 @@ def test_it_conforms(program: Path) -> None:
 
 @pytest.mark.parametrize(
     ("compiler", "options"),
-    [("cc", ("-std=c99", "-O2")), ("c++", ("-x", "c++", "-std=c++11", "-O2"))],
-    ids=["C99", "C++"],
+    [
+        (compiler, options)
+        for c, cpp in (("cc", "c++"), ("clang", "clang++"))
+        for compiler, options in (
+            (c, ("-std=c99", "-O2")),
+            (cpp, ("-x", "c++", "-std=c++11", "-O2")),
+        )
+    ],
+    ids=["C99", "C++", "C99, clang", "C++, clang"],
 )
 def test_it_compiles_without_a_warning(compiler: str, options: tuple[str, ...], tmp_path: Path) -> None:
     done = compiled(tmp_path / "cgs", compiler, *WARNINGS, *options)
@@ -113,6 +120,12 @@ def test_prefixes_of_any_length_are_taken_as_by_the_package(program: Path, tmp_p
             except BitstreamError as error:
                 expected = type(error).__name__
             assert answer == expected, size
+
+
+def test_it_has_fewer_than_1500_lines_of_code() -> None:
+    text = re.sub(r"/\*.*?\*/", "", HEADER.read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert sum(bool(line.strip()) for line in text.splitlines()) < 1500
+    assert all(len(line) <= 128 for line in text.splitlines())
 
 
 def test_its_constants_are_those_of_the_package() -> None:
