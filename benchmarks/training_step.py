@@ -74,7 +74,7 @@ def breakdown(options: argparse.Namespace) -> dict[str, Any]:
     from compgs.scene import load_scene
     from compgs.training.run.checkpoint import CHECKPOINT_NAME
     from compgs.training.run.model_checkpoint import load_checkpoint
-    from compgs.training.run.profile import WARM_UP, StepProfile
+    from compgs.training.run.profile import StepProfile
 
     scene = load_scene(options.scene[0], downscale=options.downscale[0])
     model, config = None, Config()
@@ -88,7 +88,7 @@ def breakdown(options: argparse.Namespace) -> dict[str, Any]:
     trainer = trainer_in_mid_run(scene, config, model)
     profile = StepProfile()
     profile.watch(trainer, trainer.PROFILED, trainer.stations)
-    for _ in range(WARM_UP):
+    for _ in range(profile.warm_up):
         trainer.train_step()
     before = time.process_time()
     seconds = sorted(timed_step(trainer) for _ in range(options.steps))

@@ -19,6 +19,7 @@ from compgs.former_settings import without_former
 
 PRESETS = ("default", "paper", "quick")
 SHOWN_SETTINGS = 3  # that a repr shows
+MOST_COUPLED = 64  # primitives of an anchor that a file can hold
 MAX_VIEWPOINTS = 64  # 13 bytes each; more would say nothing new
 
 
@@ -70,7 +71,7 @@ class ModelConfig:
     """Hybrid primitives and their prediction (Sec. 3.1, 3.2)."""
 
     # K, the coupled primitives of an anchor (Sec. 3.4: 10, which is slower and no better at the same size)
-    coupled_primitives: Annotated[int, Range(1, 64)] = 5
+    coupled_primitives: Annotated[int, Range(1, MOST_COUPLED)] = 5
     # channels of a reference embedding (Sec. 3.4)
     reference_dim: Annotated[int, Range(1, 256)] = 32
     # channels of a residual embedding (Sec. 3.4)

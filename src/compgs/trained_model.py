@@ -5,6 +5,7 @@ Training optimizes it, the encoder turns it into a file, `as_hybrid_model` into 
 
 import copy
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
@@ -16,6 +17,7 @@ from compgs.config import Config, ModelConfig
 from compgs.devices import placed
 from compgs.entropy.models import Quantized, make_entropy_model
 from compgs.entropy.neighbourhood import Neighbourhood, neighbourhood
+from compgs.entropy.quantization import WeightRounding
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.head_weights import HeadDimensions
 from compgs.model.hybrid_model import HybridModel
@@ -147,6 +149,8 @@ class TrainedModel(nn.Module):
         self.heads = make_heads(m.heads, HeadDimensions(m.reference_dim, m.residual_dim, m.width))
         self.entropy = make_entropy_model(m, config.entropy)
         self._neighbourhood: tuple[Tensor, Neighbourhood] | None = None  # of the coordinates as they were
+        self._weights_rest = False
+        self._rounding: WeightRounding | None = None  # of the heads' weights, while they rest
         self.register_buffer("coordinates", coordinates.to(torch.int32))
         self.register_buffer("mask", torch.ones(n, m.coupled_primitives, dtype=torch.bool))
         self.log_scales = nn.Parameter(torch.zeros(n, 6))
@@ -304,7 +308,23 @@ class TrainedModel(nn.Module):
 
     def stored_head_weights(self) -> dict[str, Tensor]:
         """The heads' parameters as the file will hold them, by name, straight-through."""
-        return {name: self.weights.rounded(name, p) for name, p in self.heads.named_parameters()}
+        weights = dict(self.heads.named_parameters())
+        rounding = self._rounding
+        if rounding is None:
+            bits = [self.weights.bits(name, weight) for name, weight in weights.items()]
+            rounding = WeightRounding.of(list(weights.values()), bits)
+            if self._weights_rest:
+                self._rounding = rounding
+        return dict(zip(weights, rounding.applied(list(weights.values())), strict=True))
+
+    @contextmanager
+    def weights_at_rest(self) -> Iterator[None]:
+        """Inside, nobody changes the heads' weights: what rounding adds to them is found once."""
+        self._weights_rest = True
+        try:
+            yield
+        finally:
+            self._weights_rest, self._rounding = False, None
 
     @torch.no_grad()
     def as_hybrid_model(self, *, stored_weights: bool = True) -> HybridModel:
@@ -344,6 +364,7 @@ class TrainedModel(nn.Module):
         return latents.bits_in_file if in_file else latents.bits
 
     def estimated_bits(self, mask: Tensor | None = None) -> dict[str, float]:
-        """Sums of `bits_of_anchors`."""
+        """Sums of `bits_of_anchors`; a GPU is waited for once beside them."""
         bits = self.bits_of_anchors(mask)
-        return {name: float(b.sum(dtype=torch.float64)) for name, b in bits.items()}
+        sums = torch.stack([b.sum(dtype=torch.float64) for b in bits.values()]).tolist()
+        return dict(zip(bits, sums, strict=True))

@@ -115,11 +115,10 @@ def test_a_run_that_was_stopped_among_coarse_steps_continues_exactly(
         assert torch.equal(a, b), name
 
 
-def test_coarse_photographs_are_kept_within_a_bound(
-    blob_scene: Scene, tiny_config: Config, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(coarse, "KEPT_BYTES", 3 * 3 * 12 * 9)
+def test_coarse_photographs_are_kept_within_a_bound(blob_scene: Scene, tiny_config: Config) -> None:
     views = CoarseViews(Trainer(blob_scene, tiny_config, CPU).views, 0.7)
+    views.photographs.most_bytes = 3 * 3 * 12 * 9
     for view in range(8):
         views.look(view, blob_scene.train_views[view].camera, 0.0)
-        assert len(views.kept) == min(3, view + 1) and (view, 2) in views.kept
+        kept = views.photographs.targets
+        assert len(kept) == min(3, view + 1) and (view, 2) in kept

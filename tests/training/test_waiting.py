@@ -48,6 +48,34 @@ def valueless_trainer(scene, config: Config, monkeypatch) -> Trainer:
     return trainer
 
 
+@pytest.mark.parametrize("learned", ["exposure", "poses", "robust"])
+def test_what_is_learned_of_each_photograph_needs_no_value_of_a_step(
+    blob_scene, tiny_config, monkeypatch, learned
+):
+    value = "on" if learned == "poses" else True
+    config = replace(tiny_config, training=replace(tiny_config.training, **{learned: value}))
+    trainer = valueless_trainer(blob_scene, config, monkeypatch)
+    monkeypatch.setattr(where, "choosing_pays", lambda device: False)
+    trainer.views = valueless_views(trainer.views, monkeypatch)
+    for _ in range(len(blob_scene.train_views) + 1):  # one is looked at again
+        trainer.step = 29  # nothing else is due
+        trainer.train_step()
+
+
+def valueless_views(views, monkeypatch):
+    """What is learned of the training views, without values."""
+    for part in views.learned:
+        for rows in (getattr(part, name, None) for name in ("photographs", "lenses", "rows")):
+            if rows is not None:
+                rows.numbers, rows.moments, rows.units = (
+                    tensor.to(META) for tensor in (rows.numbers, rows.moments, rows.units)
+                )
+        for name in ("weights", "spread", "differences", "_looked_at"):
+            if isinstance(getattr(part, name, None), torch.Tensor):
+                setattr(part, name, getattr(part, name).to(META))
+    return views
+
+
 @pytest.mark.parametrize("layout", ["paired", "separate"])
 @pytest.mark.parametrize("progress", [0.0, 0.15, 0.75])
 def test_a_step_needs_no_value_but_which_anchors_are_in_view(

@@ -21,7 +21,7 @@ from compgs.tensors import where
 class Neighbourhood:
     """The neighbours of N anchors, which are numbered as in the model."""
 
-    anchors: Tensor  # [N, most] int64; behind an anchor's last neighbour any
+    anchors: Tensor  # [N, most] int32; behind an anchor's last neighbour any
     weights: Tensor  # [N, most] float32: those of an anchor sum to 1, or it has none; 0 behind the last
 
     @torch.no_grad()
@@ -46,8 +46,10 @@ class Neighbourhood:
             [torch.ones_like(deviations[:, :1]), deviations.abs().mean(1, keepdim=True), deviations], 1
         )
         anchors, weights = self.anchors.index_select(0, rows), self.weights.index_select(0, rows)
-        around = said.index_select(0, anchors.view(-1)).view(*anchors.shape, said.shape[1])
-        return (weights[:, :, None].to(said.dtype) * around).sum(1)
+        # Sums as it reads: what all neighbours of all rows say would take a GPU hundreds of megabytes.
+        return torch.nn.functional.embedding_bag(
+            anchors, said, per_sample_weights=weights.to(said.dtype), mode="sum"
+        )
 
     def to(self, device: torch.device) -> "Neighbourhood":
         return Neighbourhood(self.anchors.to(device), self.weights.to(device))
@@ -73,7 +75,7 @@ def neighbourhood(coordinates: Tensor) -> Neighbourhood:
         counts_around[known:end] = np.diff(first)
         found.append((known, first, neighbours, weights))
     most = max(1, int(counts_around.max()))
-    anchors = np.zeros((len(voxels), most), np.int64)
+    anchors = np.zeros((len(voxels), most), np.int32)
     shares = np.zeros((len(voxels), most), np.float32)
     for known, first, neighbours, weights in found:
         own = np.repeat(np.arange(len(first) - 1), np.diff(first))

@@ -6,6 +6,9 @@ values with uniform noise (Ballé et al. 2017); both as in the authors' release.
 """
 
 import copy
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -80,15 +83,30 @@ class UniformNoise:
 
 def weight_exponent(weight: Tensor, bits: int) -> int:
     """Largest e in 0..24 for which round(weight * 2^e) fits into `bits` signed bits."""
-    return int(_weight_exponent(weight, bits))
+    return int(_exponents(_largest(weight), largest_integer(bits)))
 
 
-def _weight_exponent(weight: Tensor, bits: int) -> Tensor:
-    """[] float64; stays on the weight's device, as reading it would wait for a GPU in every step."""
-    if not weight.numel():
-        return torch.zeros((), dtype=torch.float64, device=weight.device)
-    largest = weight.detach().abs().max().double()
-    limit = (1 << (bits - 1)) - 1
+def largest_integer(bits: int) -> int:
+    """The largest that so many signed bits hold; its negative is the smallest."""
+    return (1 << (bits - 1)) - 1
+
+
+def in_stored_steps(weight: Tensor, bits: int) -> Tensor:
+    """The weight in units of the step in which the file will hold it, not rounded; found without reading a value."""
+    return weight * torch.exp2(_exponents(_largest(weight), largest_integer(bits))).to(weight.dtype)
+
+
+def _largest(weight: Tensor) -> Tensor:
+    """[] the largest size of a weight; 0 if there is none."""
+    sizes = weight.detach().abs()
+    return sizes.max() if sizes.numel() else sizes.sum()
+
+
+def _exponents(largest: Tensor, limit: Tensor | int) -> Tensor:
+    """[...] float64: largest e in 0 to 24 for which weights of `largest` sizes [...] stay within a `limit`, as integers
+    after a multiplication by 2^e. On the device of the weights: to read them would wait for a GPU in every step.
+    """
+    largest = largest.double()
     exponent = torch.floor(torch.log2(limit / largest))
     exponent = torch.where(torch.round(largest * torch.exp2(exponent)) > limit, exponent - 1.0, exponent)
     # Zero, and what is not finite (the loss says so if a training has diverged), count as 0.
@@ -98,7 +116,47 @@ def _weight_exponent(weight: Tensor, bits: int) -> Tensor:
 
 def quantize_weight(weight: Tensor, bits: int) -> Tensor:
     """The weight as the file will hold it (an integer of `bits` bits times a power of two), straight-through."""
-    step = torch.exp2(-_weight_exponent(weight, bits)).to(weight.dtype)
-    limit = (1 << (bits - 1)) - 1
+    limit = largest_integer(bits)
+    step = torch.exp2(-_exponents(_largest(weight), limit)).to(weight.dtype)
     stored = (weight.detach() / step).round().clamp_(-limit, limit) * step
     return weight + (stored - weight).detach()
+
+
+@dataclass(frozen=True)
+class WeightRounding:
+    """What rounding adds to several weights, found for all of them at once: a GPU starts two dozen kernels in place of
+    a dozen for each weight.
+    """
+
+    added: Tensor  # [all numbers of the weights, one weight after the other]
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, weights: Sequence[Tensor], bits: Sequence[int]) -> "WeightRounding":
+        """Round weights, of which none is empty, to so many `bits` each, as `quantize_weight` does."""
+        flat = _joined(weights)
+        owner, limits = _owners(tuple(w.numel() for w in weights), tuple(bits), flat.device)
+        largest = flat.new_zeros(len(weights)).scatter_reduce_(0, owner, flat.abs(), "amax")
+        steps = torch.exp2(-_exponents(largest, limits)).to(flat.dtype)[owner]
+        limit = limits.to(flat.dtype)[owner]
+        return cls((flat / steps).round().clamp(-limit, limit) * steps - flat)
+
+    def applied(self, weights: Sequence[Tensor]) -> list[Tensor]:
+        """The weights as the file will hold them, straight-through."""
+        flat = _joined(weights) + self.added
+        parts = flat.split([weight.numel() for weight in weights])
+        return [part.view(weight.shape) for part, weight in zip(parts, weights, strict=True)]
+
+
+def _joined(weights: Sequence[Tensor]) -> Tensor:
+    return torch.cat([weight.reshape(-1) for weight in weights])
+
+
+@functools.lru_cache(maxsize=64)
+def _owners(lengths: tuple[int, ...], bits: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Which weight each number of several belongs to, and [weights] float64 the largest integer of each; kept, as a
+    copy to a GPU waits for it to finish its work.
+    """
+    owner = torch.repeat_interleave(torch.arange(len(lengths)), torch.tensor(lengths))
+    limits = torch.tensor([largest_integer(b) for b in bits], dtype=torch.float64)
+    return owner.to(device), limits.to(device)

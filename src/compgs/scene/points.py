@@ -49,6 +49,16 @@ def colors_at(points: Points, positions: np.ndarray) -> np.ndarray:
     return (points.colors[found] / 255.0 * weights[..., None]).sum(1)
 
 
+def neighbour_distance(positions: np.ndarray) -> np.ndarray:  # [P, 3] -> [P]
+    """How far a point's neighbours are from it: the root of the mean square of three distances; 1 if it has none."""
+    count = min(4, len(positions))
+    if count < 2:
+        return np.ones(len(positions))
+    distances, _ = nearest(positions, positions, count)
+    squares: np.ndarray = distances[:, 1:] ** 2
+    return np.sqrt(squares.mean(1))
+
+
 def median_spacing(positions: np.ndarray) -> float:  # positions: [P, 3] world units
     """The median distance of a point to its nearest neighbour; copies of a point count as one. World units.
 

@@ -75,9 +75,9 @@ class _Rows(torch.autograd.Function):
 
 
 @functools.lru_cache(maxsize=4096)
-def camera_center(camera: Camera, device: torch.device) -> Tensor:
-    """[3] float32, world units; kept, as a copy to a GPU waits for it to finish its work."""
-    return torch.tensor(camera.center, dtype=torch.float32, device=device)
+def camera_center(camera: Camera, device: torch.device, dtype: torch.dtype = torch.float32) -> Tensor:
+    """[3] world units; kept, as a copy to a GPU waits for it to finish its work."""
+    return torch.tensor(camera.center, dtype=dtype, device=device)
 
 
 # the equations ---------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from compgs.gaussians import Gaussians
 from compgs.model.constants import CUTOFF_SIGMAS
 from compgs.model.degrees import degree_of
 from compgs.model.splats import ORIGIN, SplatArrays
+from compgs.tensors.prediction import camera_center
 from compgs.tensors.spherical_harmonics import view_colors
 
 
@@ -61,7 +62,7 @@ def splat_gaussians(
     """What a camera sees, differentiable. `degree` of the harmonics to use, all by default; splats outside of
     `visible` [M] bool are given without color: they must not reach the image.
     """
-    center = torch.as_tensor(camera.center, dtype=splats.means.dtype, device=splats.means.device)
+    center = camera_center(camera, splats.means.device, splats.means.dtype)
     degree = splats.degree if degree is None else degree
     return Gaussians(
         splats.means,

@@ -28,7 +28,6 @@ HEAD_RATES = {
     "color": (8e-3, 8e-5),
 }
 ADAM_EPSILON = 1e-15  # gradients of single primitives are tiny (3DGS)
-BETAS = (0.9, 0.999)  # Adam's, for one view a step
 
 
 def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.Adam:
@@ -64,7 +63,7 @@ def rates_for(views: int, rates: tuple[float, float]) -> tuple[float, float]:
     return rates[0] * math.sqrt(views), rates[1] * math.sqrt(views)
 
 
-def betas_for(views: int, betas: tuple[float, float] = BETAS) -> tuple[float, float]:
+def betas_for(views: int, betas: tuple[float, float] = (0.9, 0.999)) -> tuple[float, float]:
     """Adam's, of steps of so many views, from those of steps of one."""
     return betas[0] ** views, betas[1] ** views
 

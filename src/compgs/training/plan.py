@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from compgs.config import MAX_VIEWPOINTS, Config, ModelConfig
+from compgs.config import MAX_VIEWPOINTS, MOST_COUPLED, Config, ModelConfig
 from compgs.errors import ConfigError
 from compgs.render.settings import LEAST_DILATION
 
@@ -27,24 +27,16 @@ USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 # preset's curves of docs/results (plush and brighton, 1 500 and 5 000 steps, lambda 0.0001 to 0.1). Sizes are met
 # within a factor of 2 (one standard deviation), at worst 3.5.
 ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 1.5
-FEWEST_KNOWN, MOST_KNOWN = (
-    1_000,
-    20_000,
-)  # anchors of the beginning for which that line is known to hold, about
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
 # two bits of an anchor there, which has a hundred and more.
 MANY_ANCHORS = 20_000
-FEW_VIEWS = 15  # training views, and fewer, are few; twice as many are not any more
-MOST_COUPLED = 64  # primitives of an anchor that a file can hold
-# Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
-# up for an error.
-LOOKED_AT, PRUNED_BY = 48, 256
+# Views that are rendered at most, spread evenly over all, to estimate the size: the rest of the run makes up for an
+# error.
+LOOKED_AT = 48
 # Pixels of the photographs between two points that are found in them before a large capture's run: 65 000 points on
 # Truck, half as many as it has. Without them walls and trees stay blurred (docs/results/truck.md).
 POINTS_APART = 12.0
-# What the rules decide by, where it is no yes or no. Voxels grow with a power of lambda / 0.002 above it, the gradient
-# that asks for a new anchor with another: anchors cost bits.
-VOXEL_EXPONENT, GROWTH_EXPONENT = 1 / 6, 1 / 3
+# What the rules decide by, where it is no yes or no.
 # Where training views are few: share of the primitives that a step does without, and by which pruning counts a bit as
 # cheaper, as what adds little may be all that one view has.
 FEW_VIEWS_DROPOUT, FEW_VIEWS_DISCOUNT = 0.2, 0.5
@@ -75,8 +67,8 @@ class Start:
 
     @property
     def fewness(self) -> float:
-        """1 where training views are few, 0 where they are many."""
-        return min(1.0, max(0.0, 2.0 - self.views / FEW_VIEWS))
+        """1 where training views are few, up to 15, and 0 where they are many, from twice that on."""
+        return min(1.0, max(0.0, 2.0 - self.views / 15))
 
     @property
     def few(self) -> bool:
@@ -122,12 +114,13 @@ def growth_factor(config: Config, lmbda: float) -> float:
     if not in_force("growth", config):
         return 1.0
     least, most = LAMBDA_RANGE
-    return (min(max(lmbda, least), most) / USUAL_LAMBDA) ** GROWTH_EXPONENT
+    return (min(max(lmbda, least), most) / USUAL_LAMBDA) ** (1 / 3)
 
 
 def _voxels(config: Config, start: Start, spacings: float) -> float:
+    """Anchors cost bits: voxels grow with lambda."""
     dearer = min(start.lmbda, LAMBDA_RANGE[1]) / USUAL_LAMBDA
-    return spacings * max(1.0, dearer) ** VOXEL_EXPONENT
+    return spacings * max(1.0, dearer) ** (1 / 6)
 
 
 # Where two rules set the same value, the later one goes on from what the earlier one chose.
@@ -407,7 +400,8 @@ def lambda_for(bytes_per_anchor: float) -> float:
 
 def expected_bytes(start: Start) -> float | None:
     """Bytes of the file, about: the inverse of `lambda_for`. None where it is not known."""
-    if start.lmbda <= 0 or not FEWEST_KNOWN <= start.anchors <= MOST_KNOWN:
+    # From some thousand anchors of the beginning on, until they are many, the line is known to hold.
+    if start.lmbda <= 0 or not 1_000 <= start.anchors <= MANY_ANCHORS:
         return None
     return start.anchors * (ONE_BYTE_LAMBDA / start.lmbda) ** (1 / SIZE_EXPONENT)
 
@@ -436,9 +430,9 @@ def in_force(name: str, config: Config) -> bool:
 
 def pruning_views(views: int) -> int:
     """Training views that a pruning renders: half of them, in half of the time that all take; it chooses about the same
-    anchors.
+    anchors. No more than 256: the rest of the run makes up for an error.
     """
-    return min(PRUNED_BY, max(LOOKED_AT, math.ceil(views / 2)))
+    return min(256, max(LOOKED_AT, math.ceil(views / 2)))
 
 
 def _by_settings(config: Config, start: Start) -> dict[str, Any]:

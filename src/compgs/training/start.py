@@ -11,10 +11,9 @@ from compgs.codec.format import LARGEST_DILATION, SMALLEST_DILATION
 from compgs.config import MAX_VIEWPOINTS, Config, ModelConfig
 from compgs.errors import ConfigError
 from compgs.numerics.evenly import evenly
-from compgs.numerics.nearest import nearest
 from compgs.progress import shown_count
 from compgs.render.settings import as_angle
-from compgs.scene.points import colors_at, median_spacing, voxel_grid
+from compgs.scene.points import colors_at, median_spacing, neighbour_distance, voxel_grid
 from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Points, Scene
 from compgs.scene.world import local_scene, world_offset
@@ -25,7 +24,6 @@ from compgs.training.run.distributed import world
 from compgs.training.run.seen_points import sightings
 
 CPU = torch.device("cpu")
-COARSER = 1.25  # voxels, from one try to the next, until there are no more anchors than allowed
 
 
 def start_of(scene: Scene, config: Config, device: torch.device, anchors: int) -> Start:
@@ -98,7 +96,7 @@ def initial_model(
     model.head_bits = head_bits(config, chosen.start, config.training.lmbda, model.anchors)
     with torch.no_grad():
         model.log_scales.copy_(
-            torch.from_numpy(np.log(anchor_spacing(coordinates))).float()[:, None].expand(-1, 6)
+            torch.from_numpy(np.log(neighbour_distance(coordinates))).float()[:, None].expand(-1, 6)
         )
         model.entropy.fit_covariance_prior(model.log_scales)
         if m.point_colors:
@@ -148,16 +146,8 @@ def anchor_grid(scene: Scene, m: ModelConfig) -> tuple[np.ndarray, float]:
             f"model.max_anchors is {m.max_anchors}; use a larger voxel, or allow more anchors"
         )
     while len(coordinates) > m.max_anchors:  # ends: at last all points are in one voxel
-        coordinates, voxel_size = voxel_grid(scene.points, COARSER * voxel_size)
+        coordinates, voxel_size = voxel_grid(scene.points, 1.25 * voxel_size)
     return coordinates, voxel_size
-
-
-def anchor_spacing(coordinates: np.ndarray) -> np.ndarray:
-    """[N] voxels: how far an anchor's neighbours are from it, the root of the mean square of three distances."""
-    neighbours = min(4, len(coordinates))
-    distances, _ = nearest(coordinates, coordinates, neighbours)
-    spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(1)
-    return np.maximum(spread, 0.1)
 
 
 def logit(colors: np.ndarray) -> np.ndarray:

@@ -148,7 +148,8 @@ class Survey:
     def contributions(self, most: int = LOOKED_AT) -> Tensor:
         """[N, K] float64: what the coupled primitives add to the training views, or to at most `most` of them."""
         views = share_of_rank(spread(self.scene.train_views, most))
-        total = view_contributions(views, self.predicted, self.shape, self.settings, self.model.device)
+        with self.model.weights_at_rest():
+            total = view_contributions(views, self.predicted, self.shape, self.settings, self.model.device)
         sum_over_ranks(total)
         return total
 
@@ -161,9 +162,10 @@ class Survey:
         numbered = share_of_rank(
             [(self.step() * len(cameras) + number, camera) for number, camera in enumerate(cameras)]
         )
-        total, shown_by = squared_changes(
-            numbered, self.predicted, self.shape, self.settings, self.model.device
-        )
+        with self.model.weights_at_rest():
+            total, shown_by = squared_changes(
+                numbered, self.predicted, self.shape, self.settings, self.model.device
+            )
         sum_over_ranks(total)
         sum_over_ranks(shown_by)
         if len(cameras) < len(views):

@@ -10,9 +10,10 @@ from compgs.config import Config
 from compgs.methods.anchors.networks import ViewNetworks
 from compgs.methods.anchors.prediction import AnchorValues
 from compgs.published.anchors import AnchorScene, Frame
+from compgs.scene.points import neighbour_distance
 from compgs.scene.views import Scene
 from compgs.scene.world import local_scene, world_offset
-from compgs.training.start import anchor_grid, anchor_spacing
+from compgs.training.start import anchor_grid
 
 SIZES = 3  # log scales of the Gaussians; those of the positions stand before them
 
@@ -121,7 +122,7 @@ def initial_anchors(kind: type[AnchorModel], scene: Scene, config: Config) -> An
         torch.manual_seed(config.training.seed)
         model = kind(config, torch.from_numpy(coordinates), frame)
     with torch.no_grad():
-        model.log_scales.copy_(torch.from_numpy(np.log(anchor_spacing(coordinates))).float()[:, None])
+        model.log_scales.copy_(torch.from_numpy(np.log(neighbour_distance(coordinates))).float()[:, None])
     return model
 
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from compgs.codec.encoder import quantized_tensor
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.entropy.network import EntropyNetwork
-from compgs.entropy.quantization import quantize_weight, weight_exponent
+from compgs.entropy.quantization import in_stored_steps, quantize_weight
 from compgs.errors import NotEncodable
 from compgs.methods.anchors.model import AnchorModel
 from compgs.methods.anchors.prediction import AnchorValues
@@ -148,15 +148,14 @@ class CosaModel(AnchorModel):
     def estimated_bytes(self) -> int:
         """Estimate the bytes of the file, without writing it."""
         latents = float(self.total_bits(self.chained(None).bits, self.kept().float()))
-        networks = 0.0
+        coded = []
         for network in self.chain.networks.children():
             assert isinstance(network, ContextNetwork | EntropyNetwork)
             for weight, bias in network.layers():
-                networks += _stored_bits(weight, self.config.cosa.network_bits)
-                networks += gaussian_entropy(bias * (1 << FRACTION_BITS))
+                coded += [in_stored_steps(weight, self.config.cosa.network_bits), bias * (1 << FRACTION_BITS)]
         for weight in self.networks.weights().values():
-            networks += _stored_bits(weight, self.weight_bits(weight))
-        return int((latents + networks) / 8) + OTHER_BYTES
+            coded.append(in_stored_steps(weight, self.weight_bits(weight)))
+        return int((latents + gaussian_entropy(coded)) / 8) + OTHER_BYTES
 
     @torch.no_grad()
     def as_hybrid_model(self) -> AnchorScene:
@@ -202,10 +201,6 @@ class CosaModel(AnchorModel):
             tables=tuple(coded.tables),
             weights={n: quantized_tensor(w, self.weight_bits(w)) for n, w in self.networks.weights().items()},
         )
-
-
-def _stored_bits(weight: Tensor, bits: int) -> float:
-    return gaussian_entropy(weight * 2.0 ** weight_exponent(weight, bits))
 
 
 def _binary_entropy(p: Tensor) -> Tensor:

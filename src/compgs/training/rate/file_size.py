@@ -1,6 +1,7 @@
 """How large the file of a model would be, without writing it."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,13 +12,11 @@ from compgs.codec.mask_coder import encode_masks
 from compgs.codec.octree import encode_positions
 from compgs.codec.viewpoint_cameras import kept_viewpoints
 from compgs.entropy.network import FRACTION_BITS
-from compgs.entropy.quantization import weight_exponent
+from compgs.entropy.quantization import in_stored_steps
 from compgs.ordering.order import canonical_order
 from compgs.trained_model import TrainedModel
 
-POSITION_BITS = 10.0  # that one anchor less saves of the positions, about
 OTHER_BYTES = 350  # scene, tables, metadata, container, about
-LENS_BYTES, VIEWPOINT_BYTES = 32, 13  # of the cameras that the file keeps
 
 
 class FileSize:
@@ -69,27 +68,32 @@ def geometry_bytes(
 def anchor_bits(model: TrainedModel) -> Tensor:
     """[N] bits of each anchor's latents and position as training pays for them, all anchors being coded."""
     bits = model.bits_of_anchors(in_file=False)
-    return torch.stack(list(bits.values())).sum(0) + POSITION_BITS
+    return torch.stack(list(bits.values())).sum(0) + 10.0  # about what an anchor less saves of the positions
 
 
 @torch.no_grad()
 def fixed_bytes(model: TrainedModel) -> int:
     """Bytes of the networks and of all else that does not grow with the scene; no lambda makes them fewer."""
-    stored, bits = model.weights, 0.0
+    stored, coded = model.weights, []
     for name, tensor in model.head_tensors().items():
-        bits += gaussian_entropy(tensor * 2.0 ** weight_exponent(tensor, stored.bits(name, tensor)))
+        coded.append(in_stored_steps(tensor, stored.bits(name, tensor)))
     for network in model.entropy.coded_networks:
         for weight, bias in network.layers():
-            scaled = weight * 2.0 ** weight_exponent(weight, stored.network)
             # In halves, as the file has them: means and scales differ in spread.
-            bits += sum(gaussian_entropy(half) for half in scaled.tensor_split(2))
-            bits += sum(gaussian_entropy(half * 2.0**FRACTION_BITS) for half in bias.tensor_split(2))
+            coded += in_stored_steps(weight, stored.network).tensor_split(2)
+            coded += (bias * 2.0**FRACTION_BITS).tensor_split(2)
+    bits = gaussian_entropy(coded)
     kept = kept_viewpoints(model.most_viewpoints, len(model.coordinates))
     kept = min(len(model.viewpoints), kept)
-    return int(bits / 8) + OTHER_BYTES + (LENS_BYTES + VIEWPOINT_BYTES * kept if kept else 0)
+    # Of the cameras that the file keeps, a lens takes 32 bytes, and each viewpoint 13.
+    return int(bits / 8) + OTHER_BYTES + (32 + 13 * kept if kept else 0)
 
 
-def gaussian_entropy(values: Tensor) -> float:
-    """Bits of values that are rounded to integers and coded as if from one Gaussian of their spread."""
-    variance = float(values.detach().double().var(correction=0)) + 1 / 12  # of the rounding
-    return values.numel() * max(0.0, 0.5 * math.log2(2 * math.pi * math.e * variance))
+def gaussian_entropy(tensors: Sequence[Tensor]) -> float:
+    """Bits of tensors whose values are rounded to integers, and coded as if from one Gaussian of each tensor's spread.
+    A GPU is waited for once.
+    """
+    variances = torch.stack([values.detach().double().var(correction=0) for values in tensors]).tolist()
+    # A twelfth: of the rounding.
+    each = [max(0.0, 0.5 * math.log2(2 * math.pi * math.e * (variance + 1 / 12))) for variance in variances]
+    return sum(values.numel() * bits for values, bits in zip(tensors, each, strict=True))

@@ -16,16 +16,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-LOWEST, HIGHEST = 1e-6, 1.0  # of lambda; below, growth does not follow it any more (control.LAMBDA_RANGE)
+from compgs.training.plan import LAMBDA_RANGE
+
+# lambda at least, below which growth does not follow it any more, and at most.
+LOWEST, HIGHEST = LAMBDA_RANGE[0], 1.0
 LOOKS = 100  # estimates of the size in a run; each costs about as much as a training step
-# Of the run, after the rate has joined the loss: the entropy networks begin by knowing nothing.
-FIRST_LOOK = 0.1
-GROWING = 0.2  # integral gain of an estimate while anchors grow
-SHRINKS = 0.1  # log of the share by which a file shrinks after growth at one lambda (plush_480, 2 000 steps)
-SETTLING = (2.0, 15.0)  # integral and proportional gain after growth
-SLOW_FROM = 0.92  # of the run: from here on the integral gain falls to zero at the end
-LARGEST_STEP = math.log(1.6)  # of log lambda at one estimate
-SLOWLY = 0.05  # of the way to lambda, in its logarithm, that `slow` goes at one estimate: a fifth of the run to follow
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,8 @@ class RateState:
 
 def due(step: int, steps: int, rate_start: float) -> bool:
     """Whether the size is estimated after this step. `rate_start`: share of the run before the rate joins the loss."""
-    return step % max(1, steps // LOOKS) == 0 and step >= (rate_start + FIRST_LOOK) * steps
+    # A tenth of the run later: the entropy networks begin by knowing nothing.
+    return step % max(1, steps // LOOKS) == 0 and step >= (rate_start + 0.1) * steps
 
 
 def follow(state: RateState, size: float, target: float, *, progress: float, grown: bool) -> RateState:
@@ -65,10 +61,10 @@ def follow(state: RateState, size: float, target: float, *, progress: float, gro
     """
     error = math.log(size / target)
     if not grown:
-        return _moved(state, GROWING * (error - SHRINKS))
-    integral, proportional = SETTLING
-    if progress > SLOW_FROM:
-        integral *= (1.0 - progress) / (1.0 - SLOW_FROM)
+        # The file shrinks by a tenth after growth at one lambda (plush_480, 2 000 steps).
+        return _moved(state, 0.2 * (error - 0.1))
+    # Towards the end of the run the integral gain falls to zero.
+    integral, proportional = 2.0 * min(1.0, (1.0 - progress) / (1.0 - 0.92)), 15.0
     change = integral * error
     if state.error is not None:
         change += proportional * (error - state.error)
@@ -76,7 +72,9 @@ def follow(state: RateState, size: float, target: float, *, progress: float, gro
 
 
 def _moved(state: RateState, change: float) -> RateState:
-    change = min(max(change, -LARGEST_STEP), LARGEST_STEP)
+    most = math.log(1.6)  # at one estimate
+    change = min(max(change, -most), most)
     lmbda = min(max(state.lmbda * math.exp(change), LOWEST), HIGHEST)
     slow = max(state.lmbda_of_pruning, LOWEST)
-    return replace(state, lmbda=lmbda, slow=slow * (lmbda / slow) ** SLOWLY)
+    # A twentieth of the way, in the logarithm: it takes a fifth of the run to follow.
+    return replace(state, lmbda=lmbda, slow=slow * (lmbda / slow) ** 0.05)

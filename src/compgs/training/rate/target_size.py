@@ -16,11 +16,6 @@ from compgs.training.structure.control import ControlSchedule
 from compgs.training.structure.importance import missed
 from compgs.training.structure.pruning import paying
 
-SETTLES = (
-    1.03  # as large files may be after the last pruning: they come down by that in what is left of a run
-)
-SHARES = 10  # times in a run that the effect of later pruning is predicted
-
 
 class TargetSize:
     """Follows the size of a model in training. Raises ConfigError if its networks alone take more than the target."""
@@ -62,7 +57,8 @@ class TargetSize:
         if not math.isfinite(size):
             raise diverged(step, "rate", size)
         pruned = any(step - t.steps // LOOKS <= at < step for at in self.pruned_at)
-        if pruned or step % max(1, t.steps // SHARES) == 0 or (grown and state.error is None):
+        # What later prunings will leave is predicted after each of them, and ten times in a run.
+        if pruned or step % max(1, t.steps // 10) == 0 or (grown and state.error is None):
             share = self.lasting_share(state.lmbda_of_pruning, step)
             state = replace(state, share=share, written=self.file.written_share())
         target = max(1, t.target_bytes - fixed)
@@ -81,7 +77,8 @@ class TargetSize:
         drawn = missed(self.contributions(), self.config.control.idle_share)
         share = (target - fixed_bytes(self.model)) / max(1.0, 0.5 * (1.0 + written) * self.size(drawn))
         wanted = share * float(bits.sum(dtype=torch.float64))
-        return wanted, SETTLES * wanted if step == max(self.pruned_at) else math.inf
+        # What is left of a run after the last pruning brings a file down by 3 %.
+        return wanted, 1.03 * wanted if step == max(self.pruned_at) else math.inf
 
     def size(self, mask: Tensor | None = None) -> float:
         """Bytes of the file that depend on lambda, without the networks. `mask`: [N, K] bool, of the coupled primitives

@@ -9,13 +9,6 @@ import contextlib
 import ctypes
 from collections.abc import Iterator
 
-# <malloc.h>
-M_TRIM_THRESHOLD = -1
-M_MMAP_MAX = -4
-MOST_MAPPED = 65_536  # glibc's defaults
-TRIM_ABOVE = 128 * 1024  # bytes
-NEVER = -1
-
 
 @contextlib.contextmanager
 def freed_memory_kept() -> Iterator[None]:
@@ -26,11 +19,13 @@ def freed_memory_kept() -> Iterator[None]:
     except (AttributeError, OSError, TypeError):
         yield
         return
-    set_option(M_MMAP_MAX, 0)
-    set_option(M_TRIM_THRESHOLD, NEVER)
+    trim_threshold, most_mapped = -1, -4  # M_TRIM_THRESHOLD, M_MMAP_MAX of <malloc.h>
+    set_option(most_mapped, 0)
+    set_option(trim_threshold, -1)  # never
     try:
         yield
     finally:
-        set_option(M_MMAP_MAX, MOST_MAPPED)
-        set_option(M_TRIM_THRESHOLD, TRIM_ABOVE)
+        # glibc's defaults
+        set_option(most_mapped, 65_536)
+        set_option(trim_threshold, 128 * 1024)
         trim(0)

@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from compgs.errors import ConfigError, TrainingError
 from compgs.interrupt import held_back
 
-LARGE = 1 << 18  # numbers: smaller tensors are summed together, as each sum costs a journey
 _T = TypeVar("_T")
 
 
@@ -117,9 +116,11 @@ def sum_gradients(parameters: Iterable[nn.Parameter], *others: Tensor) -> None:
     for p in trained:
         p.grad = torch.zeros_like(p) if p.grad is None else p.grad.contiguous()
     gradients = [p.grad for p in trained if p.grad is not None]
-    small = [*(g for g in gradients if g.numel() < LARGE), *others]
+    # Small ones are summed together, as each sum costs a journey.
+    large = [g for g in gradients if g.numel() >= 1 << 18]
+    small = [*(g for g in gradients if g.numel() < 1 << 18), *others]
     bundle = torch.cat([g.reshape(-1) for g in small])
-    sum_over_ranks(bundle, *(g for g in gradients if g.numel() >= LARGE))
+    sum_over_ranks(bundle, *large)
     for g, total in zip(small, bundle.split([g.numel() for g in small]), strict=True):
         g.copy_(total.view_as(g))
 

@@ -13,11 +13,9 @@ from compgs.training.run.distributed import rank, stopping_together, world
 from compgs.training.run.divergence import diverged
 from compgs.training.run.pace import Pace
 from compgs.training.run.saving import Saving
+from compgs.training.run.shown_size import ShownSize
 from compgs.training.run.status import StepResult, TrainingStatus, training_psnr
 from compgs.training.run.time_left import TimeLeft
-
-REPORT_EVERY = 10  # steps between two status reports
-ESTIMATE_EVERY = 100  # steps between two estimates of the file's size: it may look at every primitive
 
 
 @freed_memory_kept()
@@ -33,7 +31,7 @@ def run_to_end(
     and reports."""
     if rank() > 0:
         path, on_progress, watch = None, None, None
-    saving, pace, estimate = Saving(trainer, path), Pace(), 0
+    saving, pace, size = Saving(trainer, path), Pace(), ShownSize(trainer.estimated_bytes)
     left = TimeLeft(trainer, config.steps, -(-config.views_per_step // world()))
     try:
         while trainer.step < config.steps:
@@ -41,7 +39,7 @@ def run_to_end(
                 with held_back():
                     result = trainer.train_step()
                 pace.step()
-                told = trainer.step % REPORT_EVERY == 0 or trainer.step == config.steps or saving.ended()
+                told = trainer.step % 10 == 0 or trainer.step == config.steps or saving.ended()
                 saves = saving.due()
                 # Before anything is computed from what has diverged.
                 if (told or saves) and not torch.isfinite(result.loss):
@@ -51,9 +49,8 @@ def run_to_end(
                 if on_progress and told:
                     seconds = pace.look(left.size)
                     pace.pause(left.look(seconds))
-                    if trainer.step % ESTIMATE_EVERY == 0 or not estimate:
-                        estimate = trainer.estimated_bytes()
-                    on_progress(_status(trainer, config.steps, result, estimate, seconds, left))
+                    pace.pause(size.look(last=trainer.step == config.steps))
+                    on_progress(_status(trainer, config.steps, result, size.bytes, seconds, left))
                 if watch:
                     watch(trainer)
         with stopping_together():

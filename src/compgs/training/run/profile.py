@@ -16,8 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-WARM_UP = 20  # steps that are not counted: kernels are compiled or loaded
-
 # What a step's tensors are, when the backward pass begins: each part's name, and where its gradients arrive.
 Stations = Callable[..., Iterable[tuple[str, tuple[Tensor, ...]]]]
 
@@ -25,7 +23,8 @@ Stations = Callable[..., Iterable[tuple[str, tuple[Tensor, ...]]]]
 class StepProfile:
     """Seconds by part, summed over steps."""
 
-    def __init__(self, *, warm_up: int = WARM_UP, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(self, *, warm_up: int = 20, clock: Callable[[], float] = time.perf_counter) -> None:
+        """`warm_up`: steps that are not counted, as kernels are compiled or loaded."""
         self.warm_up = warm_up
         self.clock = clock
         self.seconds: dict[str, float] = defaultdict(float)

@@ -8,11 +8,6 @@ from compgs.errors import TrainingError
 from compgs.scene.sight import depths_in
 from compgs.scene.views import Scene
 
-LOOKED_AT = 10_000  # points, spread over all of them: a share needs no more
-MIN_SEEN = 0.01  # share of the points that some training view must see; of a reconstruction it is nearly all
-MAX_TOO_NEAR = 0.5  # share of what the views see that may be too near to be drawn
-MARGIN = 0.1  # of an image's sides: what is a little outside is drawn into it
-
 
 def check_points_seen(scene: Scene, near_plane: float) -> None:
     """Raises TrainingError, with the remedy, if hardly any point is in the training views, or most are too near.
@@ -23,17 +18,18 @@ def check_points_seen(scene: Scene, near_plane: float) -> None:
     seen = np.zeros(len(positions), dtype=bool)
     depths = []
     for view in scene.train_views:
-        depth, inside = depths_in(view.camera, positions, MARGIN)
+        # With a tenth of its sides around the image: what is a little outside is drawn into it.
+        depth, inside = depths_in(view.camera, positions, 0.1)
         seen |= inside
         depths.append(depth[inside])
-    if seen.mean() < MIN_SEEN:
+    if seen.mean() < 0.01:  # of a reconstruction it is nearly all
         raise TrainingError(
             f"{scene.name}: {100 * seen.mean():.1f} % of the scene's points are in any training view; poses and points "
             "must be of one reconstruction, and poses have x to the right, y down and z forward (COLMAP)"
         )
     in_views = np.concatenate(depths)
     too_near = float((in_views < near_plane).mean())
-    if too_near > MAX_TOO_NEAR:
+    if too_near > 0.5:
         factor = 10.0 ** math.ceil(-math.log10(max(float(np.median(in_views)), 1e-30)))
         raise TrainingError(
             f"{scene.name}: {100 * too_near:.0f} % of what the training views see is nearer than {near_plane:g} world "
@@ -51,5 +47,5 @@ def sightings(scene: Scene) -> float:
 
 
 def _sample(scene: Scene) -> np.ndarray:
-    """[P, 3] float64 points, spread over all of them."""
-    return scene.points.positions[:: max(1, len(scene.points) // LOOKED_AT)].astype(np.float64)
+    """[P, 3] float64: some 10 000 points, spread over all of them; a share needs no more."""
+    return scene.points.positions[:: max(1, len(scene.points) // 10_000)].astype(np.float64)

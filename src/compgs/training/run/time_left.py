@@ -7,7 +7,7 @@ that have been timed themselves count as they were.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,10 +22,7 @@ from compgs.tensors.rasterize import rasterize
 if TYPE_CHECKING:
     from compgs.training.run.any_trainer import AnyTrainer
 
-POINTS = 200  # steps of a run, evenly spaced, that stand for all
-MOST_SIZES = 6  # that are drawn at once
 SPARED = 50.0  # times the seconds that drawing took have to pass before sizes are drawn again: 2 % of a run
-LARGE_PIXELS = 2_000_000  # of a photograph: from here on people are told what smaller ones would take
 DIVISORS = (1, 2, 4, 8)  # of the sides of large photographs, for which that is said
 
 Size = tuple[int, int]
@@ -88,12 +85,12 @@ class TimeLeft:
         return {divisor: self._of_steps(0, divisor) for divisor in DIVISORS}
 
     def _is_large(self) -> bool:
+        """Whether people are told what smaller photographs would take."""
         width, height = _size(self.trainer.camera_at(self.steps))
-        return width * height > LARGE_PIXELS
+        return width * height > 2_000_000
 
     def _of_steps(self, first: int, divisor: int) -> float:
-        points = np.linspace(first, self.steps, POINTS, endpoint=False).astype(int)
-        each = [self._of_step(_size(self._camera(int(step), divisor))) for step in points]
+        each = [self._of_step(_size(camera)) for camera in self._cameras(first, divisor)]
         return (self.steps - first) * float(np.mean(each))
 
     def _of_step(self, size: Size) -> float:
@@ -111,12 +108,12 @@ class TimeLeft:
     def _to_come(self, divisor: int, *, whole: bool = False) -> dict[Size, Camera]:
         """Cameras of all sizes from now on, or of a whole run."""
         first = 0 if whole else self.trainer.step
-        points = np.linspace(first, self.steps, POINTS, endpoint=False).astype(int)
-        cameras = (self._camera(int(step), divisor) for step in points)
-        return {_size(camera): camera for camera in cameras}
+        return {_size(camera): camera for camera in self._cameras(first, divisor)}
 
-    def _camera(self, step: int, divisor: int) -> Camera:
-        return self.trainer.camera_at(step, divisor)
+    def _cameras(self, first: int, divisor: int) -> Iterator[Camera]:
+        """The cameras of 200 steps from the `first` on, evenly spaced, which stand for all."""
+        for step in np.linspace(first, self.steps, 200, endpoint=False).astype(int):
+            yield self.trainer.camera_at(int(step), divisor)
 
 
 def drawing_seconds(scene: Renderable, camera: Camera) -> float:
@@ -135,9 +132,9 @@ def drawing_seconds(scene: Renderable, camera: Camera) -> float:
 
 
 def _some(cameras: dict[Size, Camera]) -> dict[Size, Camera]:
-    """MOST_SIZES of them at most, from the smallest to the largest."""
+    """Six of them at most, from the smallest to the largest."""
     sizes = sorted(cameras, key=_pixels)
-    chosen = np.unique(np.linspace(0, len(sizes) - 1, min(len(sizes), MOST_SIZES)).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(sizes) - 1, min(len(sizes), 6)).round().astype(int))
     return {sizes[i]: cameras[sizes[i]] for i in chosen}
 
 

@@ -15,10 +15,10 @@ from torch import Tensor, nn
 
 from compgs.cameras import Camera
 from compgs.losses import Target
+from compgs.training.step.kept_photographs import KeptPhotographs
 from compgs.training.step.views_in_turn import ViewsInTurn
 
 COARSEST_PIXELS = 40_000
-KEPT_BYTES = 1 << 29  # of coarse photographs, 3 bytes a pixel
 
 
 def halvings(progress: float, until: float, width: int, height: int) -> int:
@@ -53,7 +53,8 @@ class CoarseViews:
     def __init__(self, views: ViewsInTurn, until: float) -> None:
         self.views = views
         self.until = until  # of the run
-        self.kept: dict[tuple[int, int], tuple[Camera, Target]] = {}
+        self.cameras: dict[tuple[int, int], Camera] = {}  # by view and halvings
+        self.photographs = KeptPhotographs(1 << 29)
 
     def usual(self, cameras: Sequence[Camera], progress: float, divisor: int = 1) -> Camera:
         """The camera of a view of the usual size as a step looks at it; with sides divided by so much."""
@@ -67,19 +68,13 @@ class CoarseViews:
         times = halvings(progress, self.until, camera.width, camera.height)
         if times == 0:
             return camera, self.views.photograph(view)
-        small, target = self._halved(view, camera, times)
+        key = view, times
+        small = self.cameras.get(key) or halved(camera, times)
+        self.cameras[key] = small
+        target = self.photographs.get(
+            key, lambda: smaller(self.views.stored(view), small.width, small.height)
+        )
         return small, self.views.with_camera(view, target)
-
-    def _halved(self, view: int, camera: Camera, times: int) -> tuple[Camera, Target]:
-        kept, key = self.kept, (view, times)
-        if key not in kept:
-            small = halved(camera, times)
-            target = smaller(self.views.stored(view), small.width, small.height)
-            bound = KEPT_BYTES - target.image.numel()
-            while kept and sum(t.image.numel() for _, t in kept.values()) > bound:
-                del kept[next(iter(kept))]
-            kept[key] = small, target
-        return kept[key]
 
 
 def smaller(photograph: Target, width: int, height: int) -> Target:

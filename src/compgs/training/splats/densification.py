@@ -7,8 +7,8 @@ transparent splats are removed, and after the first reset of the opacities also 
 The published schedule counts steps of a run of 30 000. As mere fractions of a short run, it would judge splats that no
 view has shown since, or that have had no time to part from their clones, and reset opacities faster than they recover.
 So there are floors: a pass over the views between two judgements, and as many steps as published or a tenth of the
-time there is; between two resets `RECOVERY_PASSES` and `RECOVERY_STEPS`, and no reset without the time to recover
-before densification ends. Floors end at the published numbers of steps: a run of 30 000 steps goes as published.
+time there is; between two resets five passes and 300 steps, and no reset without the time to recover before
+densification ends. Floors end at the published numbers of steps: a run of 30 000 steps goes as published.
 """
 
 import math
@@ -21,12 +21,8 @@ from compgs.cameras import Camera
 from compgs.config import SplatConfig
 from compgs.tensors.splats import Splats
 
-PUBLISHED_START, PUBLISHED_EVERY, PUBLISHED_RESET = 500, 100, 3_000  # steps
-RECOVERY_PASSES = 5  # over the views
-RECOVERY_STEPS = 300  # at the published rate, a logit needs a hundred to climb from an opacity of 0.01 to 0.5
 SPLIT_INTO = 2
-SPLIT_SHRINK = 1.6  # 0.8 x the number of parts: how much smaller a part is
-LOG_SHRINK = torch.log(torch.tensor(SPLIT_SHRINK)).item()
+LOG_SHRINK = torch.log(torch.tensor(0.8 * SPLIT_INTO)).item()  # how much smaller a part is
 
 
 @dataclass(frozen=True)
@@ -55,10 +51,11 @@ def densify_schedule(config: SplatConfig, steps: int, views: int, views_per_step
     """Fractions of the run in steps; see the module's docstring for the floors."""
     stop = round(config.densify_stop * steps)
     views = math.ceil(views / views_per_step)  # steps of a pass
-    few = min(max(views, stop // 10), PUBLISHED_EVERY)
-    recovery = min(max(RECOVERY_PASSES * views, RECOVERY_STEPS), PUBLISHED_RESET)
+    few = min(max(views, stop // 10), 100)
+    # At the published rate, a logit needs a hundred steps to climb from an opacity of 0.01 to 0.5.
+    recovery = min(max(5 * views, 300), 3_000)
     return DensifySchedule(
-        start=max(1, round(config.densify_start * steps), min(views, PUBLISHED_START)),
+        start=max(1, round(config.densify_start * steps), min(views, 500)),
         stop=stop,
         every=max(1, round(config.densify_every * steps), few),
         reset_every=max(1, round(config.reset_every * steps), recovery),
@@ -85,8 +82,9 @@ class DensityControl:
     @torch.no_grad()
     def observe(self, mean_gradient: Tensor, visible: Tensor, camera: Camera) -> None:
         """One training view: gradient of the loss by the 2D means [M, 2], which splats were drawn [M] bool."""
-        half_image = mean_gradient.new_tensor([camera.width / 2, camera.height / 2])
-        self.gradient += (mean_gradient * half_image).norm(dim=1)  # (zero where it was not drawn)
+        across, down = mean_gradient.unbind(1)
+        in_half_images = torch.stack([across * (camera.width / 2), down * (camera.height / 2)], 1)
+        self.gradient += in_half_images.norm(dim=1)  # (zero where it was not drawn)
         self.seen += visible
 
     def forget(self, splats: int) -> None:

@@ -7,14 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from compgs.config import SplatConfig
-from compgs.numerics.nearest import nearest
+from compgs.scene.points import neighbour_distance
 from compgs.scene.views import Points
 from compgs.tensors.spherical_harmonics import coefficients, dc_from_color
 from compgs.tensors.splats import Splats
 from compgs.training.optimizers import ADAM_EPSILON, betas_for, rates_for, replace_parameter
-
-NEIGHBOURS = 3  # of a point: their mean distance is the size of its splat
-SMALLEST_SCALE = 1e-7**0.5  # world units, of splats whose neighbours are in the same place (3DGS)
 
 
 class SplatParameters(nn.Module):
@@ -45,10 +42,8 @@ class SplatParameters(nn.Module):
 def initial_splats(points: Points, config: SplatConfig) -> Splats:
     """Every point becomes a round splat of its color, as large as the distance to its neighbours."""
     n = len(points)
-    neighbours = min(NEIGHBOURS + 1, n)
-    distances, _ = nearest(points.positions, points.positions, neighbours)
-    spread = np.sqrt((distances[:, 1:] ** 2).mean(1)) if neighbours > 1 else np.ones(n)
-    spread = np.maximum(spread, SMALLEST_SCALE)
+    # At least what 3DGS gives splats whose neighbours are in the same place.
+    spread = np.maximum(neighbour_distance(points.positions), 1e-7**0.5)
     opacity = torch.full((n,), config.initial_opacity)
     return Splats(
         means=torch.tensor(points.positions, dtype=torch.float32),

@@ -45,8 +45,6 @@ from compgs.training.splats.parameters import (
 from compgs.training.step.pictures import Pictures
 
 METHOD = "3dgs"
-# Numbers of a splat in a .ply file of degree 0: position, normal, color, opacity, scales, rotation.
-STORED_NUMBERS = 3 + 3 + 3 + 1 + 3 + 4
 
 
 # What a profile calls the parts of a step: methods of the trainer and of what it has.
@@ -238,7 +236,9 @@ class SplatTrainer(SceneTrainer):
         known = self.hooks.estimated_bytes(self)
         if known is not None:
             return known
-        return 4 * len(self.parameters) * (STORED_NUMBERS + self.parameters.rest[0].numel())
+        # In a .ply file: position, normal, color, opacity, scales, rotation, and the higher harmonics.
+        numbers = 3 + 3 + 3 + 1 + 3 + 4 + self.parameters.rest[0].numel()
+        return 4 * len(self.parameters) * numbers
 
     def finish(self) -> None:
         """Plain 3DGS has nothing left to do: the file holds the splats as they are."""

@@ -4,6 +4,7 @@
 |---|---|
 | `moment` | what the phases of the run ask of the step |
 | `views_in_turn` | which views come next, and their photographs |
+| `kept_photographs` | photographs within a bound on memory |
 | `step_views` | the anchors that a step's views may show, and its noise |
 | `latents` | quantized anchors, their rate, and the gradients that go through both |
 | `view_gradients` | what the step learns from its views |

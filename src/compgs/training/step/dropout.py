@@ -14,8 +14,6 @@ from torch import Tensor
 from compgs.gaussians import Gaussians
 from compgs.tensors.prediction import Prediction
 
-HIGHEST_OPACITY = 0.9999  # of those that make up for the others
-
 
 def thinned(prediction: Prediction, share: float, noise: Callable[[Tensor], Tensor]) -> Gaussians:
     """The Gaussians, a random `share` of them with opacity 0, the others with more, so that the mean stays.
@@ -28,4 +26,5 @@ def thinned(prediction: Prediction, share: float, noise: Callable[[Tensor], Tens
         return gaussians
     chance = noise(prediction.opacities).index_select(0, prediction.index)
     weight = torch.where(chance < share - 0.5, 0.0, 1.0 / (1.0 - share))
-    return replace(gaussians, opacities=(gaussians.opacities * weight).clamp_max(HIGHEST_OPACITY))
+    # Those that make up for the others stay below 1.
+    return replace(gaussians, opacities=(gaussians.opacities * weight).clamp_max(0.9999))

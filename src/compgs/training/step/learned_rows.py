@@ -8,10 +8,8 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from compgs.training.run.distributed import on_any_rank
 from compgs.training.run.restoring import check_tensor
-
-MOMENTS = (0.9, 0.99)  # Adam's; the second is shorter than usual, as a row is looked at a few dozen times
-EPSILON = 1e-8
 
 
 class LearnedRows:
@@ -34,6 +32,7 @@ class LearnedRows:
         self.moments = torch.zeros(2, rows, len(units), device=device)
         self.steps = torch.zeros(rows, dtype=torch.int64)
         self._looked_at: dict[int, Tensor] = {}
+        self._there: tuple[bool, ...] = ()  # which of the last `gradients` there are
 
     def values(self) -> Tensor:
         """[R, P] of all rows."""
@@ -47,31 +46,37 @@ class LearnedRows:
 
     @torch.no_grad()
     def gradients(self, rows: Sequence[int]) -> Tensor:
-        """[len(rows), P + 1]: gradients, and whether there is one (1) or none (all 0), as `of` was not asked since."""
-        found = self.numbers.new_zeros(len(rows), len(self.units) + 1)
-        for gradient, row in zip(found, rows, strict=True):
-            leaf = self._looked_at.get(row)
+        """[len(rows), P]: gradients of this rank, to be summed over the ranks; 0 where there is none, as `of` was not
+        asked since. Whether any rank has one is known without reading a value.
+        """
+        found = self.numbers.new_zeros(len(rows), len(self.units))
+        leaves = [self._looked_at.get(row) for row in rows]
+        for gradient, leaf in zip(found, leaves, strict=True):
             if leaf is not None and leaf.grad is not None:
-                gradient[:-1], gradient[-1] = leaf.grad, 1.0
+                gradient.copy_(leaf.grad)
+        self._there = on_any_rank(*(leaf is not None and leaf.grad is not None for leaf in leaves))
         self._looked_at.clear()
         return found
 
     @torch.no_grad()
     def learn(self, progress: float, rows: Sequence[int], gradients: Tensor) -> None:
-        """One step of each row that has a gradient [len(rows), P + 1]; `progress` of the run, 0 to 1."""
+        """One step of each row that has a gradient: `gradients` [len(rows), P], of the same rows as last asked for and
+        summed over the ranks; `progress` of the run, 0 to 1.
+        """
         first, last = self.learning_rates
         rate = first * (last / first) ** progress
-        for row, there, gradient in zip(rows, gradients[:, -1].tolist(), gradients[:, :-1], strict=True):
+        for row, there, gradient in zip(rows, self._there, gradients, strict=True):
             if there:
                 self._step(rate, row, gradient + self.penalty * self.numbers[row])
 
     def _step(self, rate: float, row: int, gradient: Tensor) -> None:
         self.steps[row] += 1
         means = []
-        for moment, power, keep in zip(self.moments, (1, 2), MOMENTS, strict=True):
+        # Adam's; the second moment is shorter than usual, as a row is looked at a few dozen times.
+        for moment, power, keep in zip(self.moments, (1, 2), (0.9, 0.99), strict=True):
             moment[row].lerp_(gradient**power, 1 - keep)
             means.append(moment[row] / (1 - keep ** int(self.steps[row])))
-        self.numbers[row] -= rate * means[0] / (means[1].sqrt() + EPSILON)
+        self.numbers[row] -= rate * means[0] / (means[1].sqrt() + 1e-8)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors that a checkpoint holds."""

@@ -26,19 +26,9 @@ from compgs.scene.views import Scene, View
 from compgs.training.step.learned_rows import LearnedRows
 from compgs.training.step.photometry_start import starting_gains
 
-PHOTOGRAPH_RATES = (0.1, 0.002)  # a step moves an exposure by a tenth of a stop at first
-PHOTOGRAPH_PENALTY = 0.001  # what a photograph does not show well stays near the others
-LENS_RATES = (0.005, 0.0005)  # a lens is looked at far more often
-LENS_PENALTY = 0.1  # where corners show nothing, nothing else would hold the vignetting
-MIXING = 0.2  # colors mix less than they are scaled: unit of the matrix beside its diagonal
-EXPOSURE = slice(0, 1)  # of a photograph's 9 numbers: stops
-BALANCE = slice(1, 3)  # red and blue of the diagonal; green takes what makes the trace 0
-MIXED = slice(3, 9)  # the matrix beside its diagonal, row by row
-VIGNETTING = slice(0, 9)  # of a lens's 15 numbers: a1, a2, a3 of each color
-RESPONSE = slice(9, 15)  # bend and contrast of each color
-FEW_SHARE = (
-    3  # photographs of a camera, on average: with fewer, cameras do not say which photographs share a lens
-)
+# A photograph's numbers: stops; red and blue of the diagonal, of which green takes what makes the trace 0; the matrix
+# beside its diagonal, row by row. A lens's: a1, a2, a3, bend and contrast of each color.
+OF_PHOTOGRAPH, OF_LENS = (1, 2, 6), (9, 6)
 
 
 class Photometry:
@@ -53,15 +43,20 @@ class Photometry:
         self.lens_of = lenses(views)
         count = max(self.lens_of) + 1
         self.weights = torch.bincount(torch.tensor(self.lens_of), minlength=count).to(device) / len(views)
+        # A step moves an exposure by a tenth of a stop at first; colors mix less than they are scaled. What a
+        # photograph does not show well stays near the others.
         self.photographs = LearnedRows(
             "photometry/photographs",
             len(views),
-            [1.0] * 3 + [MIXING] * 6,
+            [1.0] * 3 + [0.2] * 6,
             device,
-            PHOTOGRAPH_RATES,
-            PHOTOGRAPH_PENALTY,
+            learning_rates=(0.1, 0.002),
+            penalty=0.001,
         )
-        self.lenses = LearnedRows("photometry/lenses", count, [1.0] * 15, device, LENS_RATES, LENS_PENALTY)
+        # A lens is looked at far more often. Where corners show nothing, nothing else would hold the vignetting.
+        self.lenses = LearnedRows(
+            "photometry/lenses", count, [1.0] * 15, device, learning_rates=(0.005, 0.0005), penalty=0.1
+        )
         gains = starting_gains(scene, own)
         if gains is not None:
             self.photographs.numbers[:, :3] = torch.from_numpy(numbers_of(gains)).float().to(device)
@@ -73,13 +68,14 @@ class Photometry:
         photograph, lens = self.photographs.of(view), self.lenses.of(self.lens_of[view])
 
         def camera(rendering: Tensor) -> Tensor:
-            light = rendering * falloff(lens[VIGNETTING], self._radius(view, rendering))
-            return response(light @ color_matrix(photograph).T, lens[RESPONSE])
+            vignetting, curve = lens.split(OF_LENS)
+            light = rendering * falloff(vignetting, self._radius(view, rendering))
+            return response(light @ color_matrix(photograph).T, curve)
 
         return camera
 
     def gradients(self, views: Sequence[int]) -> tuple[Tensor, ...]:
-        """Return those of the photographs [V, 10], and of all lenses [L, 16]."""
+        """Return those of the photographs [V, 9], and of all lenses [L, 15]."""
         return self.photographs.gradients(views), self.lenses.gradients(range(len(self.weights)))
 
     def learn(self, progress: float, views: Sequence[int], gradients: Sequence[Tensor]) -> None:
@@ -92,9 +88,9 @@ class Photometry:
     def hold_means(self) -> None:
         """Only the scene says how bright and how colored everything is, and no lens brightens its corners."""
         self.photographs.numbers -= self.photographs.numbers.mean(0)
-        of_lenses = self.lenses.numbers
-        of_lenses[:, RESPONSE] -= self.weights @ of_lenses[:, RESPONSE]
-        of_lenses[:, VIGNETTING] = of_lenses[:, VIGNETTING].clamp_max(0.0)
+        vignetting, curve = self.lenses.numbers.split(OF_LENS, 1)
+        curve -= self.weights @ curve
+        vignetting.clamp_(max=0.0)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors that a checkpoint holds."""
@@ -120,10 +116,10 @@ class Photometry:
 
 def color_matrix(photograph: Tensor) -> Tensor:
     """[9] numbers of a photograph -> [3, 3] of its exposure and color."""
-    (red, blue), mixed = photograph[BALANCE], photograph[MIXED]
+    exposure, (red, blue), mixed = photograph.split(OF_PHOTOGRAPH)
     rows = [red, mixed[0], mixed[1], mixed[2], -red - blue, mixed[3], mixed[4], mixed[5], blue]
     matrix = torch.stack(rows).view(3, 3) + torch.eye(3, dtype=photograph.dtype, device=photograph.device)
-    return torch.exp2(photograph[EXPOSURE]) * matrix
+    return torch.exp2(exposure) * matrix
 
 
 def falloff(numbers: Tensor, radius: Tensor) -> Tensor:
@@ -162,7 +158,7 @@ def lenses(views: Sequence[View]) -> list[int]:
     keys: list[tuple[float, ...]] = [
         (c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (view.camera for view in views)
     ]
-    if len(keys) < FEW_SHARE * len(Counter(keys)):
+    if len(keys) < 3 * len(Counter(keys)):
         keys = [key[:2] for key in keys]
     numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     return [numbers[key] for key in keys]

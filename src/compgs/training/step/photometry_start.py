@@ -14,15 +14,6 @@ from compgs.scene.sight import depths_in, places_in
 from compgs.scene.views import Scene, View
 from compgs.training.run.distributed import sum_over_ranks
 
-MOST_POINTS = 4_000  # looked at
-LEAST_POINTS = 20  # that a photograph shows, for their median to count
-DARK, BRIGHT = 10, 245  # of 255: beyond these a value says little about the exposure
-ALIKE = (
-    0.2  # correlation of the points' colors with a photograph's, in the median: what is hidden does not agree
-)
-DISPLAY_GAMMA = 2.2  # a photograph exposed twice as long is brighter by 2^(1 / 2.2)
-MOST_STOPS = 3.0  # a start beyond them is not believed
-
 
 def starting_gains(scene: Scene, own: Sequence[int] | None = None) -> np.ndarray | None:
     """[V, 3] log2 of what the colors of each training view are multiplied by, zero in the mean; None: not known.
@@ -34,13 +25,13 @@ def starting_gains(scene: Scene, own: Sequence[int] | None = None) -> np.ndarray
         gains = gains_by_headers(scene.train_views)
     if gains is None:
         return None
-    return np.clip(gains - gains.mean(axis=0), -MOST_STOPS, MOST_STOPS)
+    return np.clip(gains - gains.mean(axis=0), -3.0, 3.0)  # more stops are not believed
 
 
 def gains_by_points(scene: Scene, own: Sequence[int]) -> np.ndarray | None:
     """[V, 3], or None where points tell too little. Each rank looks at its own views."""
     points = scene.points
-    chosen = np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).round().astype(np.int64)
+    chosen = np.linspace(0, len(points) - 1, min(len(points), 4_000)).round().astype(np.int64)
     positions, colors = np.asarray(points.positions)[chosen], points.colors[chosen]
     rows = np.zeros((len(scene.train_views), 5))  # gains, how alike colors are, and whether both are known
     for index in own:
@@ -49,7 +40,8 @@ def gains_by_points(scene: Scene, own: Sequence[int]) -> np.ndarray | None:
             rows[index] = *row[0], row[1], 1.0
     sum_over_ranks(torch.from_numpy(rows))
     gains, alike, known = rows[:, :3], rows[:, 3], rows[:, 4] > 0
-    if 2 * known.sum() < len(rows) or np.median(alike[known]) < ALIKE:
+    # What is hidden in a photograph does not agree with it.
+    if 2 * known.sum() < len(rows) or np.median(alike[known]) < 0.2:
         return None
     return np.where(known[:, None], gains, gains[known].mean(axis=0))
 
@@ -62,10 +54,11 @@ def _against_points(view: View, positions: np.ndarray, colors: np.ndarray) -> tu
     column, row = columns.astype(np.int64), rows.astype(np.int64)
     column, row = column.clip(0, camera.width - 1), row.clip(0, camera.height - 1)
     there, known = image[row, column].astype(np.float64), colors[shown].astype(np.float64)
-    useful = ((there > DARK) & (there < BRIGHT) & (known > DARK) & (known < BRIGHT)).all(axis=1)
+    # Very dark and very bright colors say little about the exposure.
+    useful = ((there > 10) & (there < 245) & (known > 10) & (known < 245)).all(axis=1)
     if (mask := view.mask) is not None:
         useful &= mask[row, column]
-    if useful.sum() < LEAST_POINTS:
+    if useful.sum() < 20:
         return None
     ratio = np.log2(there[useful] / known[useful])
     sums = there[useful].sum(axis=1), known[useful].sum(axis=1)
@@ -78,4 +71,5 @@ def gains_by_headers(views: tuple[View, ...]) -> np.ndarray | None:
     stops = [view.stops for view in views]
     if any(value is None for value in stops):
         return None
-    return np.repeat(np.array(stops, dtype=np.float64)[:, None] / DISPLAY_GAMMA, 3, axis=1)
+    # A photograph exposed twice as long is brighter by 2^(1 / 2.2), 2.2 being the gamma of displays.
+    return np.repeat(np.array(stops, dtype=np.float64)[:, None] / 2.2, 3, axis=1)

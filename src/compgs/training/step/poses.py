@@ -21,13 +21,8 @@ from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.scene.sight import depths_in
 from compgs.scene.views import Scene
+from compgs.tensors.prediction import camera_center
 from compgs.training.step.learned_rows import LearnedRows
-
-FIRST_RATES = (0.05, 0.3)  # pixels a step on a view, at the beginning of long and short runs
-FIRST_OF_LOOKS = 6.0  # pixels: the first rate, times the looks that a run has at each view
-LAST_RATE = 0.1  # times the first
-TURN, SHIFT = slice(0, 3), slice(3, 6)
-LOOKED_AT = 16  # cameras by which the distance of what they show is found
 
 
 class Poses:
@@ -59,7 +54,7 @@ class Poses:
         return replace(camera, world_to_camera=camera.world_to_camera @ pose)
 
     def gradients(self, views: Sequence[int]) -> tuple[Tensor, ...]:
-        """[V, 7], as `LearnedRows.gradients` has them."""
+        """[V, 6], as `LearnedRows.gradients` has them."""
         return (self.rows.gradients(views),)
 
     def learn(self, progress: float, views: Sequence[int], gradients: Sequence[Tensor]) -> None:
@@ -72,7 +67,8 @@ class Poses:
         """All together the cameras neither turn nor move, nor move apart."""
         numbers = self.rows.numbers
         numbers -= numbers.mean(0)
-        numbers[:, SHIFT] -= self.spread * (self.spread * numbers[:, SHIFT]).sum()
+        shift = numbers[:, 3:]
+        shift -= self.spread * (self.spread * shift).sum()
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors that a checkpoint holds."""
@@ -84,16 +80,17 @@ class Poses:
 
 
 def rates(looks: float) -> tuple[float, float]:
-    """Pixels a step on a view, first and last of a run that looks at each so often."""
-    least, most = FIRST_RATES
-    first = min(most, max(least, FIRST_OF_LOOKS / max(looks, 1.0)))
-    return first, LAST_RATE * first
+    """Pixels a step on a view, first and last of a run that looks at each view so often: at the first rate, all these
+    looks together would move it by six pixels.
+    """
+    first = min(0.3, max(0.05, 6.0 / max(looks, 1.0)))
+    return first, 0.1 * first
 
 
 def moved(gaussians: Gaussians[Tensor], offset: Tensor, camera: Camera) -> Gaussians[Tensor]:
     """Gaussians turned about the camera's center and shifted, by an offset [6] along the axes of the world."""
-    turn, shift = offset[TURN], offset[SHIFT]
-    center = torch.as_tensor(camera.center, dtype=gaussians.means.dtype, device=gaussians.means.device)
+    turn, shift = offset.split(3)
+    center = camera_center(camera, gaussians.means.device, gaussians.means.dtype)
     means = (gaussians.means - center) @ rotation_matrix(turn).T + (center + shift)
     return replace(gaussians, means=means, quaternions=turned(gaussians.quaternions, turn))
 
@@ -118,8 +115,8 @@ def turned(quaternions: Tensor, turn: Tensor) -> Tensor:
 
 
 def usual_depth(scene: Scene) -> float:
-    """World units: the median distance of the points that a camera shows, along its axis, over some cameras."""
-    views = scene.train_views[:: max(1, len(scene.train_views) // LOOKED_AT)]
+    """World units: the median distance of the points that a camera shows, along its axis, over some 16 cameras."""
+    views = scene.train_views[:: max(1, len(scene.train_views) // 16)]
     medians = []
     for view in views:
         depth, inside = depths_in(view.camera, np.asarray(scene.points.positions, dtype=np.float64))

@@ -14,13 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from compgs.losses import Target, as_taken
+from compgs.tensors import where
+from compgs.training.run.distributed import on_any_rank
 from compgs.training.run.restoring import check_tensor
 
 GRID = 48  # cells along each side of a photograph
-KEPT = 0.6  # of a cell's mean difference, from one look to the next
-FROM = 0.1  # of the run: before, everything differs
-FAR_MORE = 6.0  # times the median of all cells
-LEAST = 0.1  # of 0 to 1: a smaller difference is never left out
 
 
 class Robust:
@@ -31,8 +29,10 @@ class Robust:
     def __init__(self, views: int, device: torch.device) -> None:
         self.differences = torch.zeros(views, GRID, GRID, device=device)
         self.looks = torch.zeros(views, dtype=torch.int64)
+        self._looked_at = torch.zeros(views, 1, 1, dtype=torch.bool, device=device)  # beside the differences
         self.progress = 0.0
         self._seen: dict[int, Tensor] = {}
+        self._there: tuple[bool, ...] = ()  # which of the last `gradients` there are
 
     @torch.no_grad()
     def trusted(self, view: int, image: Tensor, target: Target) -> Target:
@@ -42,24 +42,32 @@ class Robust:
             photograph = photograph / 255.0
         difference = (as_taken(image.detach(), target) - photograph).abs().mean(2)
         self._seen[view] = cells(difference, target.counted)
-        if self.progress < FROM or self.looks[view] == 0:
+        if self.progress < 0.1 or self.looks[view] == 0:  # at first everything differs
             return target
         left_out = pixels(smooth(self.differences[view]) > self.limit(), *difference.shape)
         counted = ~left_out if target.counted is None else target.counted & ~left_out
-        return replace(target, counted=counted) if left_out.any() and counted.any() else target
+        if where.choosing_pays(counted.device):
+            return replace(target, counted=counted) if left_out.any() and counted.any() else target
+        # Where nothing would be left, all counts as before; not asked, as the answer would have to come from the GPU.
+        before = torch.ones_like(counted) if target.counted is None else target.counted
+        return replace(target, counted=torch.where(counted.any(), counted, before))
 
-    def limit(self) -> float:
-        """Difference from which on a cell is left out."""
-        looked_at = self.differences[self.looks > 0]
-        return max(LEAST, FAR_MORE * float(looked_at.median())) if len(looked_at) else LEAST
+    def limit(self) -> Tensor:
+        """[] difference from which on a cell is left out, once any view was looked at: six times the median of all
+        cells, and a tenth of what lies between black and white.
+        """
+        known = torch.where(self._looked_at, self.differences, torch.inf).view(-1).sort().values
+        median = known[(int((self.looks > 0).sum()) * GRID * GRID - 1) // 2]
+        return (6.0 * median).clamp_min(0.1)
 
     @torch.no_grad()
     def gradients(self, views: Sequence[int]) -> tuple[Tensor, ...]:
-        """[V, cells + 1]: differences of this step's looks, and whether there was one; to be summed over the ranks."""
-        found = self.differences.new_zeros(len(views), GRID * GRID + 1)
+        """[V, GRID, GRID]: differences of this rank's looks in this step, to be summed over the ranks."""
+        found = self.differences.new_zeros(len(views), GRID, GRID)
         for row, view in zip(found, views, strict=True):
             if view in self._seen:
-                row[:-1], row[-1] = self._seen[view].view(-1), 1.0
+                row.copy_(self._seen[view])
+        self._there = on_any_rank(*(view in self._seen for view in views))
         self._seen.clear()
         return (found,)
 
@@ -67,11 +75,13 @@ class Robust:
     def learn(self, progress: float, views: Sequence[int], gradients: Sequence[Tensor]) -> None:
         """Remember the looks of a step; `progress` of the run, 0 to 1."""
         self.progress = progress
-        for view, row, there in zip(views, gradients[0], gradients[0][:, -1].tolist(), strict=True):
+        for view, now, there in zip(views, gradients[0], self._there, strict=True):
             if there:
-                now, first = row[:-1].view(GRID, GRID), self.looks[view] == 0
-                self.differences[view] = now if first else self.differences[view].lerp(now, 1 - KEPT)
+                first = self.looks[view] == 0
+                # From one look to the next a cell keeps six tenths of its mean.
+                self.differences[view] = now if first else self.differences[view].lerp(now, 1 - 0.6)
                 self.looks[view] += 1
+                self._looked_at[view] = True
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors that a checkpoint holds."""
@@ -88,6 +98,7 @@ class Robust:
             check_tensor(tensors[name], value.shape, value.dtype, name)
         self.differences.copy_(tensors["robust/differences"])
         self.looks.copy_(tensors["robust/looks"])
+        self._looked_at = (self.looks > 0)[:, None, None].to(self.differences.device)
         self.progress = float(tensors["robust/progress"])
 
 

@@ -47,7 +47,7 @@ class ViewGradients:
 
     def learn(self, shown: Quantized, views: StepViews, now: Moment) -> list[StepResult]:
         """Compute the gradients of this rank's views, by latents that were cut from their graph."""
-        with self.shared_geometry(shown, views, now) as geometry:
+        with self.model.weights_at_rest(), self.shared_geometry(shown, views, now) as geometry:
             return [self.learn_from(shown, geometry, views, number, now) for number in views.own.numbers]
 
     @contextmanager

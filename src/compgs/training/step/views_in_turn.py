@@ -22,11 +22,10 @@ from compgs.gaussians import Gaussians
 from compgs.losses import Target
 from compgs.scene.views import Scene, View
 from compgs.training.run.distributed import share_of_rank, world
+from compgs.training.step.kept_photographs import KeptPhotographs
 from compgs.training.step.photometry import Photometry
 from compgs.training.step.poses import Poses
 from compgs.training.step.robust import Robust
-
-KEPT_BYTES = 8 << 30  # of photographs on a GPU, 3 bytes a pixel
 
 
 class ViewsInTurn:
@@ -58,7 +57,7 @@ class ViewsInTurn:
         self.device = device
         self.chance = np.random.default_rng(seed)
         self.order: list[int] = []  # the views still to come in this round of their lane, taken from the end
-        self.photographs: dict[int, Target] = {}  # on a GPU
+        self.photographs = KeptPhotographs(8 << 30)  # on a GPU
         lanes = set(share_of_rank(range(per_step)))
         own = [view for view in range(len(self.views)) if view % per_step in lanes]
         self.photometry = Photometry(scene, device, own) if settings.exposure else None
@@ -125,13 +124,8 @@ class ViewsInTurn:
         """
         if self.device.type == "cpu":
             return Target.from_image(self.views[index].image, mask=self.views[index].mask)
-        kept = self.photographs
-        if index not in kept:
-            target = Target.from_image(self.views[index].image, self.device, self.views[index].mask)
-            while kept and sum(t.image.numel() for t in kept.values()) + target.image.numel() > KEPT_BYTES:
-                del kept[next(iter(kept))]
-            kept[index] = target
-        return kept[index]
+        view = self.views[index]
+        return self.photographs.get(index, lambda: Target.from_image(view.image, self.device, view.mask))
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint holds, as JSON takes it; `views` are the names by which a scene is known again."""

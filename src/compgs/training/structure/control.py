@@ -24,6 +24,7 @@ from torch import Tensor
 
 from compgs.cameras import Camera
 from compgs.config import Config, ControlConfig
+from compgs.scene.points import COORDINATE_BITS
 from compgs.tensors.prediction import Prediction
 from compgs.training.optimizers import AnchorRows, replace_rows
 from compgs.training.plan import growth_factor
@@ -31,10 +32,7 @@ from compgs.training.structure.variants import VARIANTS
 
 # (gradient threshold factor, grid size in voxels), coarse first
 GROWTH_LEVELS = ((1.0, 16), (2.0, 4), (4.0, 1))
-COORDINATE_LIMIT = 1 << 20  # voxels: what the octree coder can hold
-# Steps: with fewer views than that, passes are counted as if there were as many, or control would come every few steps.
-# The published scenes have 109 training views and more.
-SHORTEST_PASS = 100
+COORDINATE_LIMIT = 1 << (COORDINATE_BITS - 1)  # voxels
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,9 @@ def make_schedule(config: ControlConfig, steps: int, views: int, views_per_step:
     """
 
     def pass_steps(passes: float) -> int:
-        return round(passes * max(views, SHORTEST_PASS) / views_per_step)
+        # As if there were a hundred views at least, or control would come every few steps. The published scenes have
+        # 109 training views and more.
+        return round(passes * max(views, 100) / views_per_step)
 
     start, every = round(config.start * steps), round(config.every * steps)
     variant = VARIANTS[config.variant]
@@ -271,12 +271,13 @@ def _cell(coordinates: Tensor, size: int) -> Tensor:
 
 
 def _key(cells: Tensor) -> Tensor:
-    """One int64 a cell, 21 bits an axis."""
-    shifted = cells + COORDINATE_LIMIT
-    return (shifted[:, 0] << 42) | (shifted[:, 1] << 21) | shifted[:, 2]
+    """One int64 a cell, COORDINATE_BITS an axis."""
+    x, y, z = (cells + COORDINATE_LIMIT).unbind(1)
+    return (x << 2 * COORDINATE_BITS) | (y << COORDINATE_BITS) | z
 
 
 def _cell_of(key: Tensor) -> Tensor:
     """Inverse of `_key`: [N, 3] int64."""
-    mask = (1 << 21) - 1
-    return torch.stack([key >> 42, (key >> 21) & mask, key & mask], 1) - COORDINATE_LIMIT
+    mask = (1 << COORDINATE_BITS) - 1
+    x, y, z = key >> 2 * COORDINATE_BITS, (key >> COORDINATE_BITS) & mask, key & mask
+    return torch.stack([x, y, z], 1) - COORDINATE_LIMIT

@@ -30,13 +30,6 @@ from compgs.trained_model import TrainedModel
 from compgs.training.optimizers import replace_parameter
 from compgs.training.run.restoring import check_tensor
 
-# Learning rate of a channel that spreads over one step; it goes with the root of the spread, down to the second number.
-# Rates a seventh higher and lower came out alike (docs/results/decisions.md).
-RATE_OF_ONE, SMALLEST_RATE = 1.75, 0.6
-# Spread in steps below which a channel is dropped: one symbol in ten is other than zero there; 0.25 and 0.35 came out
-# alike.
-SILENT = 0.3
-
 
 @torch.no_grad()
 def principal_axes(references: Tensor) -> Tensor:
@@ -54,10 +47,10 @@ def principal_axes(references: Tensor) -> Tensor:
 
 @torch.no_grad()
 def channel_rates(references: Tensor) -> Tensor:
-    """[C] learning rates of the channels of references [N, C], in quantization steps, as multiples of their group's."""
-    return torch.from_numpy(np.maximum(RATE_OF_ONE * np.sqrt(_spread(references)), SMALLEST_RATE)).to(
-        references
-    )
+    """[C] learning rates of the channels of references [N, C], in quantization steps, as multiples of their group's:
+    they go with the root of the spread. Rates a seventh higher and lower came out alike (docs/results/decisions.md).
+    """
+    return torch.from_numpy(np.maximum(1.75 * np.sqrt(_spread(references)), 0.6)).to(references)
 
 
 class ChannelRates:
@@ -123,7 +116,8 @@ def drop_silent_channels(model: TrainedModel, optimizer: torch.optim.Optimizer) 
     they are on average goes into biases.
     """
     spread = _spread(model.references)
-    kept = torch.from_numpy(spread >= min(SILENT, spread.max()))
+    # With a spread of 0.3 steps one symbol in ten is other than zero; 0.25 and 0.35 came out alike.
+    kept = torch.from_numpy(spread >= min(0.3, spread.max()))
     silent = torch.nonzero(~kept.to(model.device)).view(-1)
     average = model.references.index_select(1, silent).mean(0)
     for reader in model.readers():

@@ -1,9 +1,9 @@
 """Anchors pay for themselves: those go whose bits cost more than the error that they keep away (not in the paper).
 
 Without anchor n the images of the training views would change by d_n. Where the loss is as small as it gets, it is
-flat: what an anchor keeps away from it is of second order, WORTH times the mean of d_n^2 over all values of all views,
-part of which the other anchors take over in what is left of the run. Its bits b_n cost lambda * RATE_PER_BIT / N * b_n,
-as in the objective (`losses.rate`).
+flat: what an anchor keeps away from it is of second order, `control.prune_worth` times the mean of d_n^2 over all
+values of all views, part of which the other anchors take over in what is left of the run. Its bits b_n cost
+lambda * RATE_PER_BIT / N * b_n, as in the objective (`losses.rate`).
 
 The squares need no image without the anchor. With random signs s of the values, the expectation of (sum of s d_n)^2 is
 the sum of d_n^2 (Hutchinson 1989), and one backward pass gives the sums of s d_n of all anchors at once. Each view has
@@ -24,11 +24,6 @@ from compgs.render import RasterSettings
 from compgs.tensors.contributions import signed_changes
 from compgs.tensors.prediction import Prediction
 from compgs.training.shortcuts.coarse import COARSEST_PIXELS, halved, times_halved
-
-MOST = 0.5  # of the anchors, that one pruning takes: what replaces each other must not go together
-# A further pruning takes what the first would at a higher price, about: by then the others have taken over (plush_480
-# and fox, 1 500 steps).
-LATER = 0.2
 
 
 @torch.no_grad()
@@ -90,12 +85,14 @@ def paying(
 ) -> Tensor:  # [N] bool
     """The anchors that stay: those worth their bits, and of the others the best while all that stay have fewer bits
     than `least_bits`; if they have more than `most_bits`, the best. What no view would miss goes, of the rest at most
-    half in a pruning.
+    half in a pruning: what replaces each other must not go together.
     """
-    price = bit_price(lmbda, len(bits)) * (1.0 - discount) * (1.0 + LATER * (prunings - 1))
+    # A further pruning takes what the first would at a fifth more, about: by then the others have taken over
+    # (plush_480 and fox, 1 500 steps).
+    price = bit_price(lmbda, len(bits)) * (1.0 - discount) * (1.0 + 0.2 * (prunings - 1))
     worth = control.prune_worth * changes / bits.double()
     stays = changes > 0
-    most = int((1.0 - (1.0 - MOST) ** prunings) * stays.sum())
+    most = int((1.0 - 0.5**prunings) * stays.sum())
     worst = torch.nonzero(stays).view(-1)
     worst = worst[torch.argsort(worth[worst], stable=True)[:most]]
     with_it = (bits * stays).sum() - bits[worst].cumsum(0) + bits[worst]
