@@ -1,12 +1,21 @@
 import dataclasses
 import math
 import typing
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Annotated, Literal
 
 import pytest
 
-from compgs.config import PRESETS, Config, Phases, Range, config_from_dict, load_config, wrong_value
+from compgs.config import (
+    PRESETS,
+    Config,
+    Phases,
+    QuantizationSteps,
+    Range,
+    config_from_dict,
+    load_config,
+    wrong_value,
+)
 from compgs.errors import ConfigError
 from compgs.former_settings import FORMER
 from compgs.former_settings import VARIANTS as FORMER_VARIANTS
@@ -46,8 +55,8 @@ def test_an_unknown_preset_is_named_with_the_known_ones():
         ("control", "growth_probabilities", [0.5, 0.5, 7.0]),
         ("control", "growth_probabilities", [0.5, 0.5]),
         ("entropy", "network_blocks", -3),
-        ("entropy", "network_width", 10**8),
-        ("entropy", "reference_step", 0.0),
+        ("entropy", "network_bits", 10**8),
+        ("entropy", "quantization_steps", [0.0, 0.5, 0.15]),
         ("model", "coupled_primitives", 65),
         ("model", "width", 12),
         ("model", "voxel_size", math.inf),
@@ -127,8 +136,45 @@ def test_shares_of_a_run_that_were_settings_of_their_own_are_its_phases() -> Non
     assert found.training.borders == Phases(warm=0.05, rate=0.2, symbols=1.0, weights=0.8, mean=0.75)
 
 
+def test_quantization_steps_that_were_settings_of_their_own_are_one() -> None:
+    found = config_from_dict({"entropy": {"reference_step": 1.0, "covariance_step": 0.01}})
+    assert found.entropy.steps == QuantizationSteps(reference=1.0, residual=0.5, covariance=0.01)
+    assert config_from_dict(found.to_dict()) == found
+
+
+def test_entropy_networks_of_earlier_versions_were_as_wide_as_the_others_or_had_no_hidden_layers() -> None:
+    assert config_from_dict({"entropy": {"network_width": 64}}) == Config()
+    same = {"model": {"width": 64}, "entropy": {"network_blocks": 2, "network_width": 64}}
+    assert config_from_dict(same).entropy.network_blocks == 2
+    with pytest.raises(ConfigError, match=r"network_width = 16 is no setting any more; .*model[.]width"):
+        config_from_dict({"entropy": {"network_blocks": 2, "network_width": 16}})
+
+
+@pytest.mark.parametrize(
+    ("variant", "steps", "meant_for", "same"),
+    [
+        ("published", 5_000, 30_000, True),
+        ("published", 40_000, 0, True),
+        ("published", 5_000, 0, False),
+        ("default", 5_000, 0, True),
+        ("default", 5_000, 4_000, True),
+        ("default", 5_000, 30_000, False),
+    ],
+)
+def test_rates_of_entropy_networks_of_earlier_versions_go_by_the_variant(
+    variant: str, steps: int, meant_for: int, same: bool
+) -> None:
+    values = {"control": {"variant": variant}, "training": {"steps": steps, "entropy_lr_steps": meant_for}}
+    if same:
+        assert config_from_dict(values).training.steps == steps
+    else:
+        with pytest.raises(ConfigError, match=r"entropy_lr_steps = .* is no setting any more; .*published"):
+            config_from_dict(values)
+
+
 def test_the_control_of_earlier_versions_is_one_of_the_variants() -> None:
-    assert {name: asdict(variant) for name, variant in VARIANTS.items()} == FORMER_VARIANTS
+    counted = {name: asdict(replace(variant, entropy_steps=0)) for name, variant in VARIANTS.items()}
+    assert counted == {name: {**values, "entropy_steps": 0} for name, values in FORMER_VARIANTS.items()}
     for name, settings in FORMER_VARIANTS.items():
         assert config_from_dict({"control": dict(settings)}).control.variant == name
     with pytest.raises(ConfigError, match=r"no control[.]variant has all these values"):
@@ -136,7 +182,11 @@ def test_the_control_of_earlier_versions_is_one_of_the_variants() -> None:
 
 
 def test_settings_of_earlier_versions_that_would_matter_are_refused_with_what_to_do() -> None:
-    for section, key, value in (("training", "rate_every", 8), ("training", "color_lr", [1e-3, 1e-4])):
+    for section, key, value in (
+        ("training", "rate_every", 8),
+        ("training", "color_lr", [1e-3, 1e-4]),
+        ("training", "appearance_dtype", "bfloat16"),
+    ):
         values = Config().to_dict()
         values[section][key] = value
         with pytest.raises(ConfigError, match=rf"{key} = .* is no setting any more; "):

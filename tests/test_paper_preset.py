@@ -26,13 +26,10 @@ PUBLISHED = {
     "model.row_context": False,
     "model.point_colors": False,
     "entropy.reference_hyper_dim": 4,
-    "entropy.reference_step": 1.0,
-    "entropy.residual_step": 1.0,
-    "entropy.covariance_step": 0.01,
+    "entropy.quantization_steps": (1.0, 1.0, 0.01),  # of references, residuals, log scales
     "entropy.decorrelate_at": (),
     "entropy.quantized": True,
     "entropy.network_blocks": 2,
-    "entropy.network_width": 32,
     "control.stop": 0.5,
     "control.gradient_threshold": 1e-4,
     "control.growth_probabilities": (0.5, 0.75, 0.875),
@@ -107,8 +104,6 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         "training.exposure": "off",
         "training.poses": "no rule is applied",
         "training.robust": "off",
-        "training.appearance_dtype": "float32",
-        "training.entropy_lr_steps": "bounds of short runs",
         "training.viewpoints": "what the file keeps beside the scene",
     }
     names = {
@@ -118,7 +113,6 @@ def test_no_setting_of_the_default_preset_slips_in(paper: Config) -> None:
         if section != "splats"
     }
     assert names == PUBLISHED.keys() | free.keys()
-    assert paper.training.appearance_dtype == "float32"
 
 
 def test_entropy_networks_have_two_residual_blocks_of_width_32_and_a_linear_skip(model: TrainedModel) -> None:

@@ -16,7 +16,7 @@ N, K, G, STEP = 6, 3, 2, 0.5
 def made(*, own: bool) -> TrainedModel:
     torch.manual_seed(0)
     config = Config(model=ModelConfig(coupled_primitives=K, residual_dim=G, residuals=own))
-    config = replace(config, entropy=replace(config.entropy, residual_step=STEP))
+    config = replace(config, entropy=replace(config.entropy, quantization_steps=(0.33, STEP, 0.15)))
     coordinates = torch.arange(3 * N, dtype=torch.int32).view(N, 3)
     model = TrainedModel(config, coordinates, 0.1, 1.0, (0.0, 0.0, 0.0))
     with torch.no_grad():

@@ -232,7 +232,6 @@ def variants(given: Given) -> dict[str, Any]:
         "four views a step": {"training": {"views_per_step": 4}},
         "own residuals": {"model": {"residuals": True}},
         "separate heads": {"model": {"heads": "separate"}},
-        "bfloat16": {"training": {"appearance_dtype": "bfloat16"}},
         "a size": {"training": {"target_bytes": 30_000}},
     }
     losses = {}

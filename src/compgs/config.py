@@ -66,6 +66,14 @@ class Phases(NamedTuple):
     mean: float = 0.9
 
 
+class QuantizationSteps(NamedTuple):
+    """Quantization steps by what they are of: a value of `entropy.quantization_steps`."""
+
+    reference: float = 0.33
+    residual: float = 0.5
+    covariance: float = 0.15
+
+
 @dataclass(frozen=True)
 class ModelConfig:
     """Hybrid primitives and their prediction (Sec. 3.1, 3.2)."""
@@ -108,25 +116,28 @@ class EntropyConfig:
 
     # hyperprior channels of a reference embedding, if it has a hyperprior (Ref.)
     reference_hyper_dim: Annotated[int, Range(1, 64)] = 4
-    # quantization step of reference embeddings (1 in Sec. 3.4 costs 0.5 dB in short runs)
-    reference_step: Annotated[float, Range(0, 1e3, above=True, below=True)] = 0.33
-    # quantization step of residual embeddings (1 in Sec. 3.4)
-    residual_step: Annotated[float, Range(0, 1e3, above=True, below=True)] = 0.5
-    # initial learned steps of the anchors' log scales (Sec. 3.4: 0.01, which spends bits that nobody sees)
-    covariance_step: Annotated[float, Range(0, 10, above=True, below=True)] = 0.15
+    # quantization steps of reference embeddings (Sec. 3.4: 1, which costs 0.5 dB in short runs), of residual embeddings
+    # (Sec. 3.4: 1) and, at the beginning, of the anchors' log scales, whose steps are learned (Sec. 3.4: 0.01, which
+    # spends bits that nobody sees)
+    quantization_steps: Annotated[tuple[float, float, float], Range(0, 10, above=True, below=True)] = (
+        QuantizationSteps()
+    )
     # shares of the run at which references are rotated into their principal axes; the last time, channels that carry
     # almost nothing are dropped (not in the paper)
     decorrelate_at: Shares = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
     # false: latents are trained unrounded, as a bound that no file reaches (ablation)
     quantized: bool = True
-    # residual blocks of the entropy networks (two in Sec. 3.4); 0: one linear layer
+    # residual blocks of the entropy networks, as wide as `model.width` (two in Sec. 3.4); 0: one linear layer
     network_blocks: Annotated[int, Range(0, 3)] = 0
-    # width of the hidden layers of the entropy networks (Ref.)
-    network_width: Annotated[int, Range(1, 1024)] = 32
     # bits of a weight of the entropy networks in the file; the run trains with weights so rounded
     network_bits: Annotated[int, Range(6, 16)] = 10
     # bits of a weight of the prediction heads in the file
     head_bits: Annotated[int, Range(6, 16)] = 7
+
+    @property
+    def steps(self) -> QuantizationSteps:
+        """The quantization steps by name."""
+        return QuantizationSteps(*self.quantization_steps)
 
 
 @dataclass(frozen=True)
@@ -196,13 +207,9 @@ class TrainingConfig:
     head_lr: Positive = 1.0
     # course of all these learning rates (Sec. 4.1; Ref.: exponential)
     schedule: Literal["cosine", "exponential"] = "cosine"
-    # learning rate of the entropy model, at the start and at the end (Ref.: 2e-4 -> 1e-5)
+    # learning rate of the entropy model, at the start and at the end (Ref.: 2e-4 -> 1e-5); a shorter run of the
+    # published `control.variant` raises it
     entropy_lr: LearningRates = (5e-3, 1e-4)
-    # steps of the run for which `entropy_lr` is meant: a run of half the steps doubles it, so that the networks get as
-    # far; 0: `entropy_lr` as it is
-    entropy_lr_steps: Annotated[int, Range(0, 10_000_000)] = 0
-    # number format of the networks of opacity and color; bfloat16 is meant for GPUs
-    appearance_dtype: Literal["float32", "bfloat16"] = "float32"
     # true: learn exposure and color of each training photograph, vignetting and response of each lens, for photographs
     # that cameras exposed and balanced by themselves; the file holds none of it (`training/step/photometry.py`)
     exposure: bool = False

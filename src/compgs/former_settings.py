@@ -39,6 +39,10 @@ def _of_variant() -> Former:
     return Former(None, "--set control.variant= default, published or scaffold-gs decides it")
 
 
+def _of_steps() -> Former:
+    return Former(None, "--set entropy.quantization_steps=REFERENCE,RESIDUAL,COVARIANCE holds it")
+
+
 FORMER = {
     "model.voxel_rate_exponent": _of_rule(1 / 6, 0.0, "coarser_grid"),
     "control.rate_exponent": _of_rule(1 / 3, 0.0, "growth"),
@@ -58,6 +62,14 @@ FORMER = {
     "training.hard_rate": _of_phases("symbols"),
     "training.quantized_weights": _of_phases("weights"),
     "training.averaged": _of_phases("mean"),
+    "training.appearance_dtype": Former(("float32",), "networks train in float32"),
+    "training.entropy_lr_steps": Former(
+        None, "it is 30 000 with --set control.variant=published; else --set training.entropy_lr=FIRST,LAST"
+    ),
+    "entropy.network_width": Former(None, "--set model.width=WIDTH is of the entropy networks, too"),
+    "entropy.reference_step": _of_steps(),
+    "entropy.residual_step": _of_steps(),
+    "entropy.covariance_step": _of_steps(),
 }
 # The former settings of `training` that `training.phases` holds now, in its order, with their defaults.
 PHASES = {
@@ -67,6 +79,8 @@ PHASES = {
     "quantized_weights": 0.8,
     "averaged": 0.1,
 }
+# The former settings of `entropy` that `entropy.quantization_steps` holds now, in its order, with their defaults.
+STEPS = {"reference_step": 0.33, "residual_step": 0.5, "covariance_step": 0.15}
 # What `control.variant` stands for, in the former settings of `control`.
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {
@@ -111,11 +125,15 @@ OF_ANCHORS = (
 def without_former(values: Mapping[str, Any], place: str) -> dict[str, Any]:
     """Sections of settings in today's words. Raises ConfigError for a former one whose value would matter."""
     sections = {name: dict(s) if isinstance(s, Mapping) else s for name, s in values.items()}
-    control, training = sections.get("control"), sections.get("training")
+    control, training, entropy = (sections.get(name) for name in ("control", "training", "entropy"))
     if isinstance(control, dict):
         _name_variant(control, place)
+    if isinstance(entropy, dict):
+        _gather_steps(entropy)
+        _leave_width(entropy, sections.get("model"), place)
     if isinstance(training, dict):
         _gather_phases(training)
+        _leave_entropy_steps(training, control, place)
         if isinstance(sections.get("anchors"), dict):
             sections["anchors"] |= {name: training.pop(name) for name in OF_ANCHORS if name in training}
     for section, settings in sections.items():
@@ -126,10 +144,15 @@ def without_former(values: Mapping[str, Any], place: str) -> dict[str, Any]:
             value = settings.pop(key)
             known = tuple(value) if isinstance(value, list) else value
             if former.values is not None and known not in former.values:
-                raise ConfigError(
-                    f"{place}: [{section}] {key} = {value!r} is no setting any more; {former.instead}"
-                )
+                raise _refused(f"{section}.{key}", value, place)
     return sections
+
+
+def _refused(name: str, value: Any, place: str) -> ConfigError:
+    section, key = name.split(".")
+    return ConfigError(
+        f"{place}: [{section}] {key} = {value!r} is no setting any more; {FORMER[name].instead}"
+    )
 
 
 def _name_variant(control: dict[str, Any], place: str) -> None:
@@ -152,3 +175,31 @@ def _gather_phases(training: dict[str, Any]) -> None:
     if said:
         *borders, averaged = {**PHASES, **said}.values()
         training.setdefault("phases", [*borders, 1.0 - averaged])
+
+
+def _gather_steps(entropy: dict[str, Any]) -> None:
+    """Make `quantization_steps` of the steps that were settings of their own."""
+    said = {name: entropy.pop(name) for name in STEPS if name in entropy}
+    if said:
+        entropy.setdefault("quantization_steps", [*{**STEPS, **said}.values()])
+
+
+def _leave_width(entropy: dict[str, Any], model: Any, place: str) -> None:
+    """The entropy networks are as wide as the prediction networks. Raises ConfigError where they had hidden layers of
+    another width.
+    """
+    width = entropy.pop("network_width", None)
+    of_model = model.get("width", 32) if isinstance(model, Mapping) else 32
+    if width not in (None, of_model) and entropy.get("network_blocks", 0) != 0:
+        raise _refused("entropy.network_width", width, place)
+
+
+def _leave_entropy_steps(training: dict[str, Any], control: Any, place: str) -> None:
+    """Steps that the entropy model's learning rates are meant for go by the variant of control. Raises ConfigError for
+    others, where they would raise these rates.
+    """
+    meant_for = training.pop("entropy_lr_steps", None)
+    variant = control.get("variant", "default") if isinstance(control, Mapping) else "default"
+    now, steps = 30_000 if variant == "published" else 0, training.get("steps", 30_000)
+    if meant_for is not None and max(meant_for, steps) != max(now, steps):
+        raise _refused("training.entropy_lr_steps", meant_for, place)

@@ -158,7 +158,7 @@ class TrainedModel(nn.Module):
         self.residual_kind: OwnResiduals | SharedResiduals = (
             OwnResiduals()
             if m.residuals
-            else SharedResiduals(m.coupled_primitives, m.residual_dim, config.entropy.residual_step)
+            else SharedResiduals(m.coupled_primitives, m.residual_dim, config.entropy.steps.residual)
         )
         # [N, K * residual_dim] steps, or [1, K * residual_dim] where all anchors share them
         self.residuals = nn.Parameter(self.residual_kind.start(self.entropy.starting_residuals(), n))
@@ -226,7 +226,7 @@ class TrainedModel(nn.Module):
 
     def readers(self) -> Iterator[ReferenceLayer]:
         """The layers that take the references."""
-        yield from self.heads.readers(self.config.entropy.reference_step)
+        yield from self.heads.readers(self.config.entropy.steps.reference)
         yield from self.entropy.readers()
 
     def shared_residuals(self) -> Tensor:
@@ -295,13 +295,13 @@ class TrainedModel(nn.Module):
 
     def primitives(self, latents: Quantized, rows: Tensor | None = None) -> Primitives:
         """Dequantize: all K coupled primitives of the given anchors, as prediction sees them."""
-        e, d = self.config.entropy, self.dimensions
+        steps, d = self.config.entropy.steps, self.dimensions
         n = len(latents.references)
         return Primitives(
             positions=self.positions(rows),
             log_scales=latents.covariances * self.entropy.covariance_step,
-            references=latents.references * e.reference_step,
-            residuals=(latents.residuals * e.residual_step).reshape(-1, d.residual_dim),
+            references=latents.references * steps.reference,
+            residuals=(latents.residuals * steps.residual).reshape(-1, d.residual_dim),
             anchor_index=every_slot(n, d.coupled_primitives, self.device),
             voxel_size=self.voxel_size,
         )

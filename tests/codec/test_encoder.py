@@ -36,8 +36,8 @@ def config_of(blocks: int, residuals: bool = True, width: int = 16, context: Any
     """
     context = context or ("hyperprior" if blocks else "none")
     return Config(
-        model=ModelConfig(residuals=residuals, reference_context=context),
-        entropy=EntropyConfig(network_blocks=blocks, network_width=width),
+        model=ModelConfig(residuals=residuals, reference_context=context, width=width),
+        entropy=EntropyConfig(network_blocks=blocks),
     )
 
 
@@ -335,7 +335,7 @@ def test_the_network_that_is_trained_is_the_one_in_the_file(blocks, bits):
 
 def test_an_entropy_model_of_every_kind_is_written_as_the_paper_has_it():
     """Roles, contexts and shapes of networks: residual MLPs of so many blocks, references as context."""
-    content = to_content(made_model(50, config=config_of(blocks=2, width=12)))
+    content = to_content(made_model(50, config=config_of(blocks=2, width=24)))
     assert not any(g.shape.sees_coordinates for g in content.groups)
     assert [(g.shape.role, g.shape.context) for g in content.groups] == [
         (Role.SIDE, ()),

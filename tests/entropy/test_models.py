@@ -14,7 +14,7 @@ MODEL = ModelConfig(
     coupled_primitives=3, reference_dim=6, residuals=True, residual_dim=4, reference_context="hyperprior"
 )
 ENTROPY = EntropyConfig(reference_hyper_dim=2)
-BLOCKS = EntropyConfig(reference_hyper_dim=2, network_blocks=2, network_width=7)
+BLOCKS = EntropyConfig(reference_hyper_dim=2, network_blocks=2)
 
 
 def latents(n=50, seed=0):
@@ -25,7 +25,7 @@ def latents(n=50, seed=0):
 @pytest.fixture(params=[ENTROPY, BLOCKS], ids=["linear", "blocks"])
 def entropy(request):
     torch.manual_seed(0)
-    return make_entropy_model(MODEL, request.param)
+    return make_entropy_model(replace(MODEL, width=7), request.param)
 
 
 def test_bits_are_given_per_anchor_for_every_stream(entropy):
@@ -61,7 +61,7 @@ def test_the_prior_of_the_covariance_starts_at_the_data(entropy):
     entropy.fit_covariance_prior(log_scales)
     after = entropy(torch.zeros(500, 6), y, torch.zeros(500, 12), rate=True).bits["covariance"].mean()
     # 6 Gaussians of 0.7 natural units in steps: log2(0.7 / step sqrt(2 pi e)) bits each.
-    expected = 6 * math.log2(0.7 / ENTROPY.covariance_step * math.sqrt(2 * math.pi * math.e))
+    expected = 6 * math.log2(0.7 / ENTROPY.steps.covariance * math.sqrt(2 * math.pi * math.e))
     assert after < before
     assert float(after.detach()) == pytest.approx(expected, rel=0.05)
 

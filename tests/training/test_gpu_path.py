@@ -107,9 +107,7 @@ def test_a_run_on_the_gpus_path_goes_on_as_if_it_had_not_stopped(gpu_path, blob_
     assert torch.equal(resumed.references, whole.references)
 
 
-@pytest.mark.parametrize(
-    "change", [{"exposure": True}, {"views_per_step": 4}, {"appearance_dtype": "bfloat16"}]
-)
+@pytest.mark.parametrize("change", [{"exposure": True}, {"robust": True}, {"views_per_step": 4}])
 def test_each_option_takes_its_steps_on_the_gpus_path(gpu_path, blob_scene, tiny_config, change):
     losses = []
     train(blob_scene, small(tiny_config, **change), device="cpu", progress=lambda s: losses.append(s.loss))

@@ -126,14 +126,16 @@ def test_lambda_that_follows_a_size_is_the_one_that_weighs(blob_scene: Scene, ti
     assert losses[2] - losses[0] == pytest.approx(3 * (losses[1] - losses[0]), rel=1e-4)
 
 
-@pytest.mark.parametrize("schedule", ["cosine", "exponential"])
+@pytest.mark.parametrize(("schedule", "variant"), [("cosine", "default"), ("exponential", "published")])
 @pytest.mark.parametrize(("step", "warm_up"), [(0, 0.5), (5, 0.5), (15, 0.5), (5, 0.0)])
 def test_learning_rates_are_those_of_the_settings_at_this_step(
-    blob_scene: Scene, tiny_config: Config, schedule: str, step: int, warm_up: float
+    blob_scene: Scene, tiny_config: Config, schedule: str, variant: str, step: int, warm_up: float
 ) -> None:
     phases = CERTAIN["phases"]._replace(warm=warm_up)
-    changes = {"schedule": schedule, "phases": phases, "entropy_lr_steps": 2 * STEPS, "head_lr": 0.5}
+    changes = {"schedule": schedule, "phases": phases, "head_lr": 0.5}
     config = with_training(tiny_config, **{**CERTAIN, **changes})
+    config = replace(config, control=replace(config.control, variant=variant))
+    longer = 30_000 / STEPS if variant == "published" else 1
     t, progress = config.training, step / STEPS
     trainer = started(blob_scene, config, step)
     trainer.train_step()
@@ -142,7 +144,7 @@ def test_learning_rates_are_those_of_the_settings_at_this_step(
         "log_scales": (t.log_scale_lr, 1.0),
         "references": (t.embedding_lr, 1.0),
         "residuals": (t.embedding_lr, 1.0),
-        "entropy": (tuple(2 * rate for rate in t.entropy_lr), 1.0),
+        "entropy": (tuple(longer * rate for rate in t.entropy_lr), 1.0),
         "geometry": ((2e-3, 2e-5), rising),
         "appearance": ((4e-3, 4e-5), rising),
     }

@@ -51,7 +51,7 @@ def test_every_layout_and_rate_trains_all_parameters(
     config = replace(
         tiny_config,
         model=replace(tiny_config.model, heads=layout, residuals=residuals),
-        entropy=replace(tiny_config.entropy, network_blocks=blocks, network_width=8),
+        entropy=replace(tiny_config.entropy, network_blocks=blocks),
         training=replace(tiny_config.training, steps=20, rate=normalization),
     )
     trainer = Trainer(blob_scene, config, CPU)
@@ -217,10 +217,10 @@ def test_unquantized_latents_are_rendered_as_they_are(blob_scene, tiny_config):
     model = trainer.model
     shown = model.as_hybrid_model(stored_weights=False).primitives
     kept = model.mask.view(-1)
-    step = config.entropy.reference_step
+    step = config.entropy.steps.reference
     assert np.array_equal(shown.references, model.references.detach() * step)
     flat = model.residuals.detach().view(len(kept), -1)
-    assert np.array_equal(shown.residuals, flat[kept] * config.entropy.residual_step)
+    assert np.array_equal(shown.residuals, flat[kept] * config.entropy.steps.residual)
 
 
 def test_primitives_that_add_least_are_left_out_up_to_their_share():

@@ -112,15 +112,6 @@ def test_leaving_nothing_out_trains_the_same_model(blob_scene, tiny_config, monk
     assert losses[0] == pytest.approx(losses[1], rel=1e-4)
 
 
-def test_the_networks_of_appearance_train_in_bfloat16(blob_scene, tiny_config):
-    config = replace(tiny_config, training=replace(tiny_config.training, appearance_dtype="bfloat16"))
-    exact = Trainer(blob_scene, tiny_config, torch.device("cpu"))
-    rough = Trainer(blob_scene, config, torch.device("cpu"))
-    for _ in range(4):
-        assert float(rough.train_step().loss) == pytest.approx(float(exact.train_step().loss), rel=0.05)
-    assert all(p.dtype == torch.float32 for p in rough.model.parameters())
-
-
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_step_on_cuda_waits_for_two_numbers(blob_scene, tiny_config):

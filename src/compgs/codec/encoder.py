@@ -191,7 +191,7 @@ class _Chain:
 
 def _code_references(chain: _Chain, model: TrainedModel, kept: Tensor) -> None:
     entropy, f = model.entropy, _rows(model.references, kept)
-    steps, context = (_float32(model.config.entropy.reference_step),), entropy.reference_context
+    steps, context = (_float32(model.config.entropy.steps.reference),), entropy.reference_context
     neighbours = entropy.neighbour_network
     sides: tuple[int, ...] = ()
     if isinstance(context, Hyperprior) and neighbours is None:
@@ -224,7 +224,7 @@ def _code_residuals(chain: _Chain, model: TrainedModel, kept: Tensor) -> None:
     g = _rows(model.residuals, kept)
     references = next(i for i, group in enumerate(chain.groups) if group.shape.role == Role.REFERENCE)
     side = chain.add_side(entropy.residual_hyperprior, g)
-    steps = (_float32(model.config.entropy.residual_step),)
+    steps = (_float32(model.config.entropy.steps.residual),)
     shape = GroupShape(Role.RESIDUAL, model.dimensions.residual_dim, steps, (references, side))
     chain.add(shape, entropy.residual_network, g)
 

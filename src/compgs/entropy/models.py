@@ -83,7 +83,7 @@ class EntropyModel(nn.Module):
         super().__init__()
         self.slots = model.coupled_primitives
         self.residual_channels = model.coupled_primitives * model.residual_dim
-        shape = entropy.network_blocks, entropy.network_width
+        shape = entropy.network_blocks, model.width
         self.reference_context: Hyperprior | NoContext
         if model.reference_context == "none":
             self.reference_context = NoContext()
@@ -97,9 +97,9 @@ class EntropyModel(nn.Module):
         self.neighbour_network = NeighbourNetwork(model.reference_dim) if follows else None
         # Log scales span a few natural units, that is dozens of steps.
         self.covariance_network = EntropyNetwork(
-            model.reference_dim, 6, *shape, mean_gain=1.0 / entropy.covariance_step
+            model.reference_dim, 6, *shape, mean_gain=1.0 / entropy.steps.covariance
         )
-        self.log_covariance_step = nn.Parameter(torch.full((6,), entropy.covariance_step).log())
+        self.log_covariance_step = nn.Parameter(torch.full((6,), entropy.steps.covariance).log())
 
     @property
     def context_of_references(self) -> Literal["neighbours", "hyperprior", "none"]:
@@ -239,7 +239,7 @@ class OwnResidualsEntropyModel(EntropyModel):
             model.reference_dim + hyper,
             self.residual_channels,
             entropy.network_blocks,
-            entropy.network_width,
+            model.width,
         )
         with torch.no_grad():
             self.residual_network.biases[-1][: self.residual_channels].uniform_(-SLOT_SPREAD, SLOT_SPREAD)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from compgs.config import TrainingConfig
 from compgs.trained_model import TrainedModel
+from compgs.training.structure.variants import VARIANTS
 
 # First and last learning rate of the prediction heads, by the names of their networks (Ref.).
 HEAD_RATES = {
@@ -33,7 +34,7 @@ ADAM_EPSILON = 1e-15  # gradients of single primitives are tiny (3DGS)
 def make_optimizer(model: TrainedModel, config: TrainingConfig) -> torch.optim.Adam:
     """Groups carry their name and (first, last) learning rate; `set_learning_rates` moves between them."""
     heads, entropy = model.heads, model.entropy
-    longer = max(1.0, config.entropy_lr_steps / config.steps)
+    longer = max(1.0, VARIANTS[model.config.control.variant].entropy_steps / config.steps)
     entropy_lr = config.entropy_lr[0] * longer, config.entropy_lr[1] * longer
 
     def group(name: str, parameters: Iterable[nn.Parameter], rates: tuple[float, float]) -> dict:

@@ -30,9 +30,9 @@ ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 1.5
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
 # two bits of an anchor there, which has a hundred and more.
 MANY_ANCHORS = 20_000
-# Views that are rendered at most, spread evenly over all, to estimate the size: the rest of the run makes up for an
-# error.
-LOOKED_AT = 48
+# Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
+# up for an error.
+LOOKED_AT, PRUNED_BY = 48, 256
 # Pixels of the photographs between two points that are found in them before a large capture's run: 65 000 points on
 # Truck, half as many as it has. Without them walls and trees stay blurred (docs/results/truck.md).
 POINTS_APART = 12.0
@@ -430,9 +430,9 @@ def in_force(name: str, config: Config) -> bool:
 
 def pruning_views(views: int) -> int:
     """Training views that a pruning renders: half of them, in half of the time that all take; it chooses about the same
-    anchors. No more than 256: the rest of the run makes up for an error.
+    anchors.
     """
-    return min(256, max(LOOKED_AT, math.ceil(views / 2)))
+    return min(PRUNED_BY, max(LOOKED_AT, math.ceil(views / 2)))
 
 
 def _by_settings(config: Config, start: Start) -> dict[str, Any]:

@@ -102,7 +102,7 @@ def initial_model(
         if m.point_colors:
             logits = torch.from_numpy(logit(colors_at(scene.points, model.positions().numpy()))).float()
             model.heads.pass_colors(logits.mean(0))
-            model.references[:, :3] = (logits - logits.mean(0)) / config.entropy.reference_step
+            model.references[:, :3] = (logits - logits.mean(0)) / config.entropy.steps.reference
     if cameras:
         model.viewpoints = tuple(cameras[i] for i in choose_viewpoints(cameras, MAX_VIEWPOINTS))
         model.up = up_direction(cameras)

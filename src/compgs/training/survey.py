@@ -190,6 +190,5 @@ def predict_view(
         model.distance_unit,
         model.stored_head_weights() if stored else None,
         compact=where.choosing_pays(model.device),
-        appearance_dtype=getattr(torch, model.config.training.appearance_dtype),
         geometry=geometry,
     )
