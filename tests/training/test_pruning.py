@@ -17,7 +17,12 @@ from compgs.tensors.rasterize import rasterize
 from compgs.training.plan import pruning_views
 from compgs.training.rate.rate_control import RateState
 from compgs.training.shortcuts.coarse import halved
-from compgs.training.structure.pruning import judged, paying, random_signs, squared_changes
+from compgs.training.structure.pruning import (
+    anchors_worth_their_bits,
+    pruning_camera,
+    random_signs,
+    squared_changes,
+)
 from compgs.training.trainer import Trainer
 
 from .rules import without
@@ -147,7 +152,11 @@ def test_what_only_views_see_that_are_not_asked_outlasts_a_pruning(unequal: Trai
     assert hidden.any()
     assert (np.isinf(unequal.survey.changes(1).numpy()) == hidden).all()
     bits = torch.ones(unequal.model.anchors)
-    assert paying(unequal.survey.changes(1), bits, 0.1, unequal.config.control, 0.0).numpy()[hidden].all()
+    assert (
+        anchors_worth_their_bits(unequal.survey.changes(1), bits, 0.1, unequal.config.control, 0.0)
+        .numpy()[hidden]
+        .all()
+    )
     assert torch.isfinite(unequal.survey.changes(2)).all()
 
 
@@ -160,7 +169,8 @@ def test_large_views_are_judged_with_sides_halved(unequal: Trainer) -> None:
     """Not below forty thousand pixels: what anchors change there is about what they change in the whole image."""
     camera = unequal.scene.train_views[0].camera
     sizes = [
-        judged(camera.resized(width, height)) for width, height in ((390, 400), (480, 359), (1920, 1080))
+        pruning_camera(camera.resized(width, height))
+        for width, height in ((390, 400), (480, 359), (1920, 1080))
     ]
     assert [(c.width, c.height) for c in sizes] == [(390, 400), (240, 180), (480, 270)]
     large = camera.resized(4 * camera.width, 4 * camera.height)
@@ -222,7 +232,7 @@ def test_those_stay_whose_worth_is_more_than_the_price_of_their_bits(
 ) -> None:
     """20 x change / bits is 4, 8, 2, 32, 40, 36 x 1e-8 of those in view; a bit costs lambda x 5 / 132 / 8."""
     control = ControlConfig(prune_worth=20.0)
-    assert paying(CHANGES, BITS, lmbda, control, discount).int().tolist() == stays
+    assert anchors_worth_their_bits(CHANGES, BITS, lmbda, control, discount).int().tolist() == stays
 
 
 @pytest.mark.parametrize(
@@ -239,7 +249,10 @@ def test_of_those_that_do_not_pay_the_best_stay_while_the_file_would_be_too_smal
     least_bits: float, stays: list[int]
 ) -> None:
     control = ControlConfig(prune_worth=20.0)
-    assert paying(CHANGES, BITS, 1.27e-5, control, 0.0, least_bits=least_bits).int().tolist() == stays
+    assert (
+        anchors_worth_their_bits(CHANGES, BITS, 1.27e-5, control, 0.0, least_bits=least_bits).int().tolist()
+        == stays
+    )
 
 
 @pytest.mark.parametrize(
@@ -256,7 +269,10 @@ def test_where_the_file_would_be_too_large_those_go_that_are_worth_least(
     most_bits: float, stays: list[int]
 ) -> None:
     control = ControlConfig(prune_worth=20.0)
-    assert paying(CHANGES, BITS, 0.0, control, 0.0, most_bits=most_bits).int().tolist() == stays
+    assert (
+        anchors_worth_their_bits(CHANGES, BITS, 0.0, control, 0.0, most_bits=most_bits).int().tolist()
+        == stays
+    )
 
 
 @pytest.mark.parametrize(
@@ -270,7 +286,10 @@ def test_several_prunings_take_as_one_at_a_higher_price_but_each_at_most_half(
     control = ControlConfig(prune_worth=20.0)
     changes = CHANGES.clone()
     changes[7] = 1e-4
-    assert paying(changes, BITS, 1.27e-5, control, 0.0, prunings=prunings).int().tolist() == stays
+    assert (
+        anchors_worth_their_bits(changes, BITS, 1.27e-5, control, 0.0, prunings=prunings).int().tolist()
+        == stays
+    )
 
 
 def test_pruning_takes_what_does_not_pay_by_the_bits_of_the_file(unequal: Trainer) -> None:

@@ -1,1 +1,1 @@
-"""In which order anchors come, which of them come together, and which came before around each: from positions alone."""
+"""Order of the anchors, their ranges (levels of detail) and their neighbours. All of it follows from the positions."""

@@ -34,7 +34,7 @@ from compgs.training.plan import LOOKED_AT
 from compgs.training.run.distributed import share_of_rank, sum_over_ranks
 from compgs.training.run.restoring import check_tensor
 from compgs.training.structure.importance import spread, view_contributions
-from compgs.training.structure.pruning import judged, squared_changes
+from compgs.training.structure.pruning import pruning_camera, squared_changes
 
 MARGIN = 1.5  # for what changes between two measurements
 EVERY = 32  # steps between two; geometry alone, without gradients, is about a twentieth of a step
@@ -158,7 +158,7 @@ class Survey:
         anchor; of large ones with sides halved. Infinite: none of these may show the anchor, but another view might.
         """
         views = self.scene.train_views
-        cameras = [judged(view.camera) for view in spread(views, most)]
+        cameras = [pruning_camera(view.camera) for view in spread(views, most)]
         numbered = share_of_rank(
             [(self.step() * len(cameras) + number, camera) for number, camera in enumerate(cameras)]
         )

@@ -13,8 +13,8 @@ from compgs.training.rate.file_size import FileSize, anchor_bits, fixed_bytes
 from compgs.training.rate.rate_control import LOOKS, RateState, due, follow
 from compgs.training.run.divergence import diverged
 from compgs.training.structure.control import ControlSchedule
-from compgs.training.structure.importance import missed
-from compgs.training.structure.pruning import paying
+from compgs.training.structure.importance import needed_primitives
+from compgs.training.structure.pruning import anchors_worth_their_bits
 
 
 class TargetSize:
@@ -26,7 +26,7 @@ class TargetSize:
         schedule: ControlSchedule,
         pruned_at: frozenset[int],
         contributions: Callable[[], Tensor],  # [N, K] of the coupled primitives, to a sample of the views
-        changes: Callable[[], Tensor],  # [N] of a sample of the views without an anchor, see `pruning.paying`
+        changes: Callable[[], Tensor],  # [N] of a sample of the views without an anchor (`Survey.changes`)
         discount: float,  # share by which a bit is cheaper to pruning
     ) -> None:
         self.model = model
@@ -64,9 +64,9 @@ class TargetSize:
         target = max(1, t.target_bytes - fixed)
         return follow(state, size * state.written * state.share, target, progress=step / t.steps, grown=grown)
 
-    def bits_that_stay(self, step: int, bits: Tensor, written: float) -> tuple[float, float]:
-        """Return the fewest and most of the anchors' `bits` [N] that a pruning at this step may leave. With fewer no
-        lambda would bring the file to its size; with more after the last pruning none would in time.
+    def bits_to_keep(self, step: int, bits: Tensor, written: float) -> tuple[float, float]:
+        """Fewest and most bits that a pruning at this step may leave of the anchors' `bits` [N]. With fewer, no lambda
+        would bring the file to its size; with more after the last pruning, none would in time.
 
         `written`: of the bytes that training pays for, what a file takes as yet. What is saved becomes less as the run
         settles; reckoned is with half of it (110 kB of plush, 1 500 steps: with all of it +4.4 %, with none -3.9 %).
@@ -74,7 +74,7 @@ class TargetSize:
         target = self.config.training.target_bytes
         if target is None:
             return 0.0, math.inf
-        drawn = missed(self.contributions(), self.config.control.idle_share)
+        drawn = needed_primitives(self.contributions(), self.config.control.idle_share)
         share = (target - fixed_bytes(self.model)) / max(1.0, 0.5 * (1.0 + written) * self.size(drawn))
         wanted = share * float(bits.sum(dtype=torch.float64))
         # What is left of a run after the last pruning brings a file down by 3 %.
@@ -88,7 +88,7 @@ class TargetSize:
         return math.floor(found) if math.isfinite(found) else found
 
     def estimated_bytes(self, written: float, step: int) -> int:
-        """Bytes of the whole file if it were written now, at a step; `written`: as in `bits_that_stay`. Raises
+        """Bytes of the whole file if it were written now, at a step; `written`: as in `bits_to_keep`. Raises
         TrainingError if the latents are not finite any more.
         """
         size = written * self.file.latents()
@@ -98,7 +98,7 @@ class TargetSize:
 
     def lasting_share(self, lmbda: float, step: int) -> float:
         """Predicted share of the bytes of `size` that is left at the end of the run, after the last pruning."""
-        lasting = missed(self.contributions(), self.config.control.idle_share)
+        lasting = needed_primitives(self.contributions(), self.config.control.idle_share)
         still = sum(at >= step for at in self.pruned_at)
         if still:
             lasting &= self.lasting_anchors(lmbda, still)[:, None]
@@ -107,4 +107,6 @@ class TargetSize:
     def lasting_anchors(self, lmbda: float, still: int) -> Tensor:
         """[N] bool: those that outlast so many prunings."""
         bits = anchor_bits(self.model)
-        return paying(self.changes(), bits, lmbda, self.config.control, self.discount, prunings=still)
+        return anchors_worth_their_bits(
+            self.changes(), bits, lmbda, self.config.control, self.discount, prunings=still
+        )

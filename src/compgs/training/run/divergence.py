@@ -6,5 +6,6 @@ from compgs.errors import TrainingError
 def diverged(step: int, what: str, value: float) -> TrainingError:
     """The error to raise for a value that is not finite any more."""
     return TrainingError(
-        f"step {step}: the {what} is {value}; try another seed, or smaller learning rates (settings in _lr)"
+        f"step {step}: the {what} is {value}; try another seed (--seed), or smaller learning rates "
+        "(settings that end in _lr)"
     )

@@ -17,8 +17,8 @@ from compgs.training.run.parts import Part
 from compgs.training.structure.averaging import Averaging
 from compgs.training.structure.control import AdaptiveControl
 from compgs.training.structure.decorrelation import ChannelRates, decorrelate, drop_silent_channels
-from compgs.training.structure.importance import missed
-from compgs.training.structure.pruning import paying
+from compgs.training.structure.importance import needed_primitives
+from compgs.training.structure.pruning import anchors_worth_their_bits
 from compgs.training.survey import Survey
 
 
@@ -89,9 +89,9 @@ class Structure:
         """Remove the anchors that are not worth their bits: what is left of the run makes up for them."""
         changes = self.survey.changes(self.plan.pruning_views)
         bits = anchor_bits(self.model)
-        least, most = self.target_size.bits_that_stay(step, bits, rate.written)
+        least, most = self.target_size.bits_to_keep(step, bits, rate.written)
         lmbda, c, discount = rate.lmbda_of_pruning, self.config.control, self.plan.bit_discount
-        kept = paying(changes, bits, lmbda, c, discount, least_bits=least, most_bits=most)
+        kept = anchors_worth_their_bits(changes, bits, lmbda, c, discount, least_bits=least, most_bits=most)
         if kept.any():
             self.control.keep(self.model, self.optimizer, kept)
 
@@ -129,6 +129,6 @@ class Structure:
         self.average.settle()
         self.survey.bounds.forget()
         everything = self.survey.contributions(most=len(self.survey.scene.train_views))
-        self.model.mask = missed(everything, self.config.control.idle_share)
+        self.model.mask = needed_primitives(everything, self.config.control.idle_share)
         if not self.model.mask.any():
             raise TrainingError("no primitive is visible in any training view; the run has failed")

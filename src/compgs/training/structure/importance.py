@@ -56,6 +56,6 @@ def worth_keeping(contributions: Tensor, share: float) -> Tensor:
     return kept
 
 
-def missed(contributions: Tensor, idle_share: float) -> Tensor:
+def needed_primitives(contributions: Tensor, idle_share: float) -> Tensor:
     """[N, K] bool: coupled primitives that the views would miss, by their contributions [N, K]."""
     return worth_keeping(contributions.view(-1), idle_share).view_as(contributions)

@@ -56,8 +56,8 @@ def squared_changes(
     return total, shown_by
 
 
-def judged(camera: Camera) -> Camera:
-    """The view of a camera as anchors are judged by it: large ones with sides halved, in a fraction of the time."""
+def pruning_camera(camera: Camera) -> Camera:
+    """The view of a camera as pruning renders it: large ones with sides halved, in a fraction of the time."""
     return halved(camera, times_halved(camera.width, camera.height, COARSEST_PIXELS))
 
 
@@ -72,7 +72,7 @@ def bit_price(lmbda: float, anchors: int) -> float:
     return lmbda * RATE_PER_BIT / anchors
 
 
-def paying(
+def anchors_worth_their_bits(
     changes: Tensor,  # [N] mean squared change of a value of the training views; infinite: not known
     bits: Tensor,  # [N] of each anchor
     lmbda: float,
