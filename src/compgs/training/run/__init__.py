@@ -12,6 +12,7 @@
 | `model_checkpoint` | the hybrid method's model in it |
 | `divergence` | what is said where numbers are not finite any more |
 | `distributed` | shares a step among the processes of a torchrun |
+| `shown_size` | estimates the size of the file as often as a run can spare the time |
 | `time_left` | weighs the steps that are to come by the size of their pictures |
 | `profile`, `history` | say where the time went, and how the quality rose |
 | `allocation` | keeps memory that a step frees for the next one |
