@@ -68,7 +68,7 @@ def model(paper: Config) -> TrainedModel:
 def test_control_is_the_published_one(paper: Config) -> None:
     expected = Variant(
         start_passes=5.0, every_passes=2.0, observe_passes=3.0, minimum_share=0.2,  # (the last: bounds of short runs)
-        opacity_views=1, opacity_share=0.0, reset_all=True, finer_needs_coarser=True,
+        opacity_views=1, opacity_share=0.0, reset_all=True, finer_needs_coarser=True, entropy_steps=30_000,
     )  # fmt: skip
     assert VARIANTS[paper.control.variant] == expected
 
