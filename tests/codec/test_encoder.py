@@ -350,7 +350,7 @@ def test_an_entropy_model_of_every_kind_is_written_as_the_paper_has_it():
         if isinstance(group.prior, IntegerNetwork):
             assert [layer.adds for layer in group.prior.layers] == [False, False, True, False, True, False]
             assert [layer.rectify for layer in group.prior.layers] == [True, True, False, True, False, False]
-            assert [len(layer.bias) for layer in group.prior.layers[:-1]] == [12] * 5
+            assert [len(layer.bias) for layer in group.prior.layers[:-1]] == [24] * 5
             assert group.prior.skip
 
 
