@@ -26,8 +26,8 @@ HIDDEN = {
 
 
 def pages() -> list[Path]:
-    """Return README and the pages of the site that people read from top to bottom."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    """Return README and all pages of the site."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def sentences(text: str) -> Iterator[tuple[int, str]]:
@@ -38,7 +38,8 @@ def sentences(text: str) -> Iterator[tuple[int, str]]:
     begun = 0
     for number, line in enumerate([*text.splitlines(), ""], 1):
         item = re.match(r"\s*(?:[-*]|\d+\.) ", line)
-        other = not line.strip() or line.startswith(("|", "#", "!", ":::", "    ", "<", "---"))
+        table = line.lstrip().startswith("|")
+        other = table or not line.strip() or line.startswith(("#", "!", ":::", "    ", "<", "---"))
         if paragraph and (other or item):
             yield from ((begun, sentence) for sentence in _split(" ".join(paragraph)))
             paragraph = []
