@@ -33,12 +33,10 @@ const source = Buffer.from(outputFiles[0].text).toString("base64");
 const { TileLoader, Predictor, SplatStore, isInView, planDetail, readManifest, rowsOf, sizeOf } = await import(
   `data:text/javascript;base64,${source}`
 );
-const { wasmKernels } = await import(`${web}dist/compgs.js`);
 
 const MOVING = 60; // pictures
 const [address, most, plan] = process.argv.slice(2);
 const cameras = JSON.parse(readFileSync(0, "utf8"));
-const kernels = await wasmKernels();
 
 const processor = () => {
   const { user, system } = process.cpuUsage();
@@ -64,10 +62,9 @@ const store = new SplatStore(
   (tile) => isInView(manifest.tiles[tile], sight),
 );
 const loader = new TileLoader(manifest, address, {
-  kernels,
   most: Number(most),
   onTile(tile, scene, shift) {
-    if (scene) store.set(tile, new Predictor(scene, kernels), shift);
+    if (scene) store.set(tile, new Predictor(scene), shift);
     else store.delete(tile);
   },
   onSharp: () => store.touch(),

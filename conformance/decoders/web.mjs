@@ -1,9 +1,7 @@
 /**
  * The decoder for the web in Node, as conformance/run.py asks it: what `npm run build` in web/ makes, or CGS_BUILD names.
  *
- *     python conformance/run.py node conformance/decoders/web.mjs [plain]
- *
- * With `plain` it does without WebAssembly.
+ *     python conformance/run.py node conformance/decoders/web.mjs
  */
 
 import { readFileSync, writeFileSync } from "node:fs";
@@ -13,7 +11,6 @@ import { fileURLToPath, pathToFileURL } from "node:url";
 
 const build = process.env.CGS_BUILD ?? fileURLToPath(new URL("../../web/dist", import.meta.url));
 const compgs = await import(pathToFileURL(resolve(build, "compgs.js")));
-const kernels = process.argv[2] === "plain" ? compgs.plainKernels : await compgs.wasmKernels();
 const REFUSALS = ["NotACompGSFile", "UnsupportedVersion", "TruncatedSection", "CorruptSection", "MissingDependency"];
 const RESIDUAL = 3;
 /** Networks of each layout of the heads, and their blocks. */
@@ -24,9 +21,9 @@ const NETWORKS = {
 
 const ACTIONS = {
   decode(file, folder, size) {
-    const options = size === undefined ? { kernels } : { kernels, prefix: Number(size) };
+    const options = size === undefined ? {} : { prefix: Number(size) };
     const scene = compgs.decode(readFileSync(file), options);
-    new compgs.Predictor(scene, kernels); // refuses heads of another layout
+    new compgs.Predictor(scene); // refuses heads of another layout
     const write = (name, array) =>
       writeFileSync(join(folder, name), new Uint8Array(array.buffer, array.byteOffset, array.byteLength));
     write("coordinates", scene.coordinates);
@@ -40,10 +37,10 @@ const ACTIONS = {
   },
 
   predict(file, folder, ...center) {
-    const scene = compgs.decode(readFileSync(file), { kernels });
+    const scene = compgs.decode(readFileSync(file));
     const world = center.map((x, axis) => Number(x) + scene.worldOffset[axis]);
     const worldToCamera = [1, 0, 0, -world[0], 0, 1, 0, -world[1], 0, 0, 1, -world[2], 0, 0, 0, 1];
-    const found = compgs.gaussians(scene, { worldToCamera }, kernels);
+    const found = compgs.gaussians(scene, { worldToCamera });
     const columns = { means: 3, scales: 3, quaternions: 4, opacities: 1, colors: 3 };
     const rows = Float32Array.from({ length: 14 * found.opacities.length });
     let place = 0;

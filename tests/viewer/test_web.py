@@ -5,8 +5,6 @@ import os
 import sys
 from pathlib import Path
 
-import pytest
-
 import compgs
 
 from .conftest import WEB, run
@@ -37,10 +35,9 @@ def test_the_lock_file_names_no_host() -> None:
     assert all("integrity" in package for name, package in lock["packages"].items() if name)
 
 
-@pytest.mark.parametrize("kernels", ["wasm", "plain"])
-def test_the_decoder_for_the_web_conforms(node: str, built: Path, kernels: str) -> None:
+def test_the_decoder_for_the_web_conforms(node: str, built: Path) -> None:
     """It draws with a browser's help alone, so that pictures are not asked for."""
     judge = WEB.parent / "conformance"
-    command = [node, str(judge / "decoders" / "web.mjs"), kernels]
+    command = [node, str(judge / "decoders" / "web.mjs")]
     output = run([sys.executable, str(judge / "run.py"), *command], CGS_BUILD=str(built))
     assert output.endswith("conforms\n")

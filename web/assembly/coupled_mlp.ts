@@ -1,5 +1,6 @@
 /**
- * Residual MLPs of coupled primitives: src/prediction/coupled_mlp.ts, 16 columns at a time in 32-bit floats.
+ * Residual MLPs of coupled primitives, 16 columns at a time in 32-bit floats (docs/bitstream_prediction.md, "The residual
+ * MLP"). src/prediction/coupled_mlp.ts prepares what they take.
  *
  * Widths are padded to a multiple of 16 by zeros, outputs to a multiple of 4.
  */

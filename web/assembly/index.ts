@@ -1,6 +1,4 @@
-/**
- * The kernels of src/codec/kernels.ts and src/prediction in WebAssembly; the plain TypeScript is what they must equal.
- */
+/** The kernels of src/codec/kernels.ts in WebAssembly. Tests hold them to golden files and to what the Python package makes. */
 
 export { alloc, mark, release } from "./memory";
 export { setTables } from "./mixing";

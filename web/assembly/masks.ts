@@ -1,4 +1,4 @@
-/** Flags of the slots: src/codec/mask_coder.ts. */
+/** Flags of the slots, each predicted from its anchor's and the anchors before (docs/bitstream.md, "Masks"). */
 
 import { choose, endDecoder, mix, newMixer, startDecoder } from "./mixing";
 

@@ -1,4 +1,4 @@
-/** The arithmetic code, adaptive states and mixed decisions: src/codec/arithmetic_decoder.ts and mixer.ts. */
+/** The binary arithmetic code, adaptive states and mixed decisions (docs/bitstream.md, "Arithmetic code"). */
 
 import { alloc } from "./memory";
 

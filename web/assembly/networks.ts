@@ -1,4 +1,4 @@
-/** Integer networks: src/codec/network_evaluation.ts, two outputs at a time in 64-bit floats, which are exact here. */
+/** Integer networks, two outputs at a time: all sums are integers below 2^53, so that 64-bit floats are exact. */
 
 const LEAST: f64 = -8388608;
 const MOST: f64 = 8388607;

@@ -1,4 +1,4 @@
-/** The walk of the octree: src/codec/octree.ts. */
+/** The walk of the context-mixed octree (docs/bitstream.md, "Positions"). */
 
 import { alloc, release } from "./memory";
 import { Mixer, choose, decide, decideByState, endDecoder, mix, newMixer, newStates, startDecoder } from "./mixing";

@@ -1,4 +1,4 @@
-/** Chunks of a stream: src/codec/rans.ts. */
+/** Chunks of a stream, by asymmetric numeral systems (docs/bitstream.md, "Streams"). */
 
 import { learn, shifted, startRows } from "./rows";
 

@@ -1,4 +1,4 @@
-/** How far the tables of a row are shifted, symbol by symbol: TableShift of src/codec/rows.ts. */
+/** How far the tables of a row are shifted, symbol by symbol (docs/bitstream.md, "Rows"). */
 
 const ONE: i64 = 1 << 12;
 const RATIO_BITS: i64 = 15;

@@ -1,9 +1,6 @@
 /** Bytes of a .cgs file to a scene. */
 
-import { chooseKernels } from "./choose_kernels.ts";
 import { unpack, SectionNumber } from "./codec/container.ts";
-import type { Kernels } from "./codec/kernels.ts";
-import { plainKernels } from "./codec/plain_kernels.ts";
 import { SceneDecoder } from "./codec/scene_decoder.ts";
 import { type DecodedScene, withSplats } from "./decoded_scene.ts";
 import { ProgressiveDecoder } from "./progressive.ts";
@@ -15,13 +12,9 @@ export interface DecodeOptions {
    * bytes alone.
    */
   prefix?: boolean | number;
-  /** The loops that take the time; plain TypeScript unless given (see `wasmKernels`). */
-  kernels?: Kernels;
 }
 
 export interface StreamOptions {
-  /** The loops that take the time; WebAssembly where there is some, unless given. */
-  kernels?: Kernels;
   /** Is called with each finer scene while bytes arrive. */
   onScene?: (scene: DecodedScene) => void;
 }
@@ -30,7 +23,8 @@ export interface StreamOptions {
  * The scene in a .cgs file (docs/bitstream.md): the same integers as on every other machine. Of bytes at once, of a
  * stream, a response or a blob when all of it has arrived.
  *
- * Throws, or rejects with, NotACompGSFile, UnsupportedVersion, TruncatedSection or CorruptSection.
+ * Throws, or rejects with, NotACompGSFile, UnsupportedVersion, TruncatedSection or CorruptSection, and MissingDependency
+ * where there is no WebAssembly.
  */
 export function decode(data: ArrayBuffer | Uint8Array, options?: DecodeOptions): DecodedScene;
 export function decode(stream: ByteStream, options?: StreamOptions): Promise<DecodedScene>;
@@ -43,27 +37,23 @@ export function decode(
   return decodeStream(source, options);
 }
 
-function decodeBytes(
-  data: Uint8Array,
-  { prefix = false, kernels = plainKernels }: DecodeOptions,
-): DecodedScene {
+function decodeBytes(data: Uint8Array, { prefix = false }: DecodeOptions): DecodedScene {
   const bytes = typeof prefix === "number" ? data.subarray(0, Math.max(0, prefix)) : data;
   const isPrefix = prefix !== false;
   const { version, sections, hasAllLatents } = unpack(bytes, isPrefix);
-  const decoder = new SceneDecoder(version, sections, kernels, bytes.length, !isPrefix);
+  const decoder = new SceneDecoder(version, sections, bytes.length, !isPrefix);
   for (const section of sections) {
     if (section.number === SectionNumber.latents) decoder.addRange(section, bytes.length);
   }
   if (hasAllLatents) decoder.checkComplete();
-  return withSplats(decoder.scene(), kernels);
+  return withSplats(decoder.scene());
 }
 
 async function decodeStream(stream: ByteStream, options: StreamOptions): Promise<DecodedScene> {
-  const kernels = options.kernels ?? (await chooseKernels());
-  const decoder = new ProgressiveDecoder(kernels);
+  const decoder = new ProgressiveDecoder();
   for await (const piece of piecesOf(stream)) {
-    if (decoder.push(piece)) options.onScene?.(withSplats(decoder.scene(), kernels));
+    if (decoder.push(piece)) options.onScene?.(withSplats(decoder.scene()));
   }
   decoder.finish();
-  return withSplats(decoder.scene(), kernels);
+  return withSplats(decoder.scene());
 }

@@ -1,7 +1,6 @@
 /** A scene that tells what a camera sees of it. */
 
 import type { Camera } from "./cameras.ts";
-import type { Kernels } from "./codec/kernels.ts";
 import type { Scene } from "./codec/scene_decoder.ts";
 import { type Gaussians, gaussiansOf } from "./gaussians.ts";
 import { Predictor } from "./prediction/predictor.ts";
@@ -14,12 +13,12 @@ export interface DecodedScene extends Scene {
   splatsFor(camera: Pick<Camera, "worldToCamera">): Gaussians;
 }
 
-export function withSplats(scene: Scene, kernels: Kernels): DecodedScene {
+export function withSplats(scene: Scene): DecodedScene {
   let predictor: Predictor | null = null;
   return {
     ...scene,
     splatsFor(camera) {
-      predictor ??= new Predictor(scene, kernels);
+      predictor ??= new Predictor(scene);
       return gaussiansOf(predictor, scene.worldOffset, camera);
     },
   };

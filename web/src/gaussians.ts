@@ -1,7 +1,6 @@
 /** The Gaussians of a scene that a camera sees. */
 
 import { type Camera, cameraCentre } from "./cameras.ts";
-import type { Kernels } from "./codec/kernels.ts";
 import type { Scene } from "./codec/scene_decoder.ts";
 import { OPACITY_CUTOFF, Predictor } from "./prediction/predictor.ts";
 
@@ -22,8 +21,8 @@ export interface Gaussians {
  * What a camera of the world sees, in the order of the file. For many cameras keep a `Predictor`: geometry does not
  * depend on the camera.
  */
-export function gaussians(scene: Scene, camera: Pick<Camera, "worldToCamera">, kernels?: Kernels): Gaussians {
-  return gaussiansOf(new Predictor(scene, kernels), scene.worldOffset, camera);
+export function gaussians(scene: Scene, camera: Pick<Camera, "worldToCamera">): Gaussians {
+  return gaussiansOf(new Predictor(scene), scene.worldOffset, camera);
 }
 
 /** What a camera sees of a scene whose geometry is there. */

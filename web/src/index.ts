@@ -3,10 +3,8 @@
 export { decode, type DecodeOptions, type StreamOptions } from "./decode.ts";
 export type { DecodedScene } from "./decoded_scene.ts";
 export { type ByteStream, MEDIA_TYPE, type Source, isCgs } from "./sources.ts";
-export { chooseKernels } from "./choose_kernels.ts";
 export type { Scene, SceneGroup } from "./codec/scene_decoder.ts";
 export type { Kernels } from "./codec/kernels.ts";
-export { plainKernels } from "./codec/plain_kernels.ts";
 export { wasmKernels } from "./wasm_kernels.ts";
 export type { Viewpoint, Viewpoints } from "./codec/viewpoints.ts";
 export * from "./errors.ts";

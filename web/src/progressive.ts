@@ -9,9 +9,7 @@ import {
   unpackSection,
 } from "./codec/container.ts";
 import { FieldReader } from "./codec/fields.ts";
-import type { Kernels } from "./codec/kernels.ts";
 import { readRangeHead } from "./codec/latents.ts";
-import { plainKernels } from "./codec/plain_kernels.ts";
 import { type Scene, SceneDecoder } from "./codec/scene_decoder.ts";
 import { CorruptSection, TruncatedSection } from "./errors.ts";
 
@@ -31,10 +29,7 @@ export class ProgressiveDecoder {
   isFull = false;
 
   /** `most`: coupled primitives that are wanted. The coarsest scene of a file is there even if it has more. */
-  constructor(
-    private readonly kernels: Kernels = plainKernels,
-    private readonly most = Infinity,
-  ) {}
+  constructor(private readonly most = Infinity) {}
 
   /** Bytes of the whole file as its header has it, or null before the header is there. */
   get expectedBytes(): number | null {
@@ -122,7 +117,7 @@ export class ProgressiveDecoder {
       else this.waiting.push(section);
       return false;
     }
-    this.decoder ??= new SceneDecoder(this.header!.version, this.waiting, this.kernels, this.length, false);
+    this.decoder ??= new SceneDecoder(this.header!.version, this.waiting, this.length, false);
     this.decoder.addRange(section, this.length);
     return true;
   }

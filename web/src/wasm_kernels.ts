@@ -1,9 +1,9 @@
-/** The kernels in WebAssembly (assembly/): what plain_kernels.ts does, faster. */
+/** The kernels in WebAssembly (assembly/). */
 
 import kernelBytes from "compgs:kernels";
 import { CONFIDENCE, RATE, SQUASH, STRETCH } from "./codec/arithmetic_tables.ts";
 import type { CoupledTask, Kernels, PackedMLP } from "./codec/kernels.ts";
-import type { IntegerLayer, IntegerNetwork } from "./codec/networks.ts";
+import { type IntegerLayer, type IntegerNetwork, clampActivation } from "./codec/networks.ts";
 import {
   AROUND_HIGH,
   AROUND_LOW,
@@ -15,7 +15,7 @@ import {
   TOUCHING,
 } from "./codec/octree_grid.ts";
 import { rowTables } from "./codec/rows.ts";
-import { CorruptSection } from "./errors.ts";
+import { CorruptSection, MissingDependency } from "./errors.ts";
 
 interface Exports {
   memory: WebAssembly.Memory;
@@ -42,16 +42,30 @@ const CHUNK_PROBLEMS = [
   "a state of the entropy coder does not end where it began",
 ];
 
-/** Rejects where WebAssembly or its vectors are missing. */
-export async function wasmKernels(): Promise<Kernels> {
-  const { instance } = await WebAssembly.instantiate(kernelBytes, {
-    env: {
-      abort(): never {
-        throw new Error("the kernels ran out of memory");
-      },
+let made: Kernels | undefined;
+
+/** The kernels of this thread, made with the first call. Throws MissingDependency without WebAssembly or its vectors. */
+export function wasmKernels(): Kernels {
+  made ??= new WasmKernels(compiled().exports as unknown as Exports);
+  return made;
+}
+
+function compiled(): WebAssembly.Instance {
+  const env = {
+    abort(): never {
+      throw new Error("the kernels ran out of memory");
     },
-  });
-  return new WasmKernels(instance.exports as unknown as Exports);
+  };
+  try {
+    // At once, as they are small: only Chrome before version 114 refuses it, and in a page's main thread alone.
+    return new WebAssembly.Instance(new WebAssembly.Module(kernelBytes), { env });
+  } catch (error) {
+    const found = error instanceof Error ? error.message : String(error);
+    throw new MissingDependency(
+      `kernels: decoding needs WebAssembly with vectors, which this browser or the page's policy does not give ` +
+        `(${found}). A Content-Security-Policy must allow 'wasm-unsafe-eval'`,
+    );
+  }
 }
 
 class WasmKernels implements Kernels {
@@ -242,10 +256,6 @@ class WasmKernels implements Kernels {
 
 function evened(count: number): number {
   return count + (count & 1);
-}
-
-function clampActivation(x: number): number {
-  return Math.max(-8388608, Math.min(8388607, x));
 }
 
 function checkEnd(end: number, section: string): void {

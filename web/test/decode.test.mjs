@@ -1,47 +1,53 @@
 /** The same integers as the Python package's, of golden files and of those that make_fixtures.py writes. */
 
 import assert from "node:assert/strict";
+import { spawnSync } from "node:child_process";
 import { test } from "node:test";
-import { compgs, fixtures, goldenFiles, goldenPrefixes, hashesOf, refusedFiles } from "./fixtures.mjs";
+import {
+  compgs,
+  fixtures,
+  goldenFiles,
+  goldenPrefixes,
+  hashesOf,
+  library,
+  refusedFiles,
+} from "./fixtures.mjs";
 
-const { decode, plainKernels, wasmKernels } = compgs;
-const KINDS = { "plain TypeScript": plainKernels, WebAssembly: await wasmKernels() };
+const { decode } = compgs;
 
-for (const [kind, kernels] of Object.entries(KINDS)) {
-  for (const { name, bytes, hashes } of goldenFiles()) {
-    test(`${kind}: golden file ${name} decodes to its pinned integers`, () => {
-      assert.deepEqual(hashesOf(decode(bytes, { kernels })), hashes);
-    });
-  }
-
-  for (const { name, bytes, hashes } of goldenPrefixes()) {
-    test(`${kind}: the beginning of golden file ${name} decodes to its pinned integers`, () => {
-      assert.deepEqual(hashesOf(decode(bytes, { kernels, prefix: true })), hashes);
-    });
-  }
-
-  for (const { name, bytes, expected } of fixtures()) {
-    test(`${kind}: symbols and latents of ${name} are those of the Python package`, () => {
-      assert.deepEqual(hashesOf(decode(bytes, { kernels })), expected.hashes);
-    });
-  }
-
-  test(`${kind}: damaged files are refused as the Python package refuses them`, () => {
-    const wrong = [];
-    refusedFiles().forEach(({ data, prefix, error, anchors }, i) => {
-      let found = null;
-      let count = 0;
-      try {
-        count = decode(Buffer.from(data, "base64"), { kernels, prefix }).anchors;
-      } catch (thrown) {
-        found = thrown.name;
-      }
-      if (found !== error) wrong.push(`case ${i}: ${found}, expected ${error}`);
-      else if (count !== anchors) wrong.push(`case ${i}: ${count} anchors, expected ${anchors}`);
-    });
-    assert.deepEqual(wrong, []);
+for (const { name, bytes, hashes } of goldenFiles()) {
+  test(`golden file ${name} decodes to its pinned integers`, () => {
+    assert.deepEqual(hashesOf(decode(bytes)), hashes);
   });
 }
+
+for (const { name, bytes, hashes } of goldenPrefixes()) {
+  test(`the beginning of golden file ${name} decodes to its pinned integers`, () => {
+    assert.deepEqual(hashesOf(decode(bytes, { prefix: true })), hashes);
+  });
+}
+
+for (const { name, bytes, expected } of fixtures()) {
+  test(`symbols and latents of ${name} are those of the Python package`, () => {
+    assert.deepEqual(hashesOf(decode(bytes)), expected.hashes);
+  });
+}
+
+test("damaged files are refused as the Python package refuses them", () => {
+  const wrong = [];
+  refusedFiles().forEach(({ data, prefix, error, anchors }, i) => {
+    let found = null;
+    let count = 0;
+    try {
+      count = decode(Buffer.from(data, "base64"), { prefix }).anchors;
+    } catch (thrown) {
+      found = thrown.name;
+    }
+    if (found !== error) wrong.push(`case ${i}: ${found}, expected ${error}`);
+    else if (count !== anchors) wrong.push(`case ${i}: ${count} anchors, expected ${anchors}`);
+  });
+  assert.deepEqual(wrong, []);
+});
 
 for (const { name, bytes, expected } of fixtures()) {
   test(`${name}: each prefix is the scene that the Python package decodes of it`, () => {
@@ -66,6 +72,16 @@ for (const { name, bytes, expected } of fixtures()) {
     assertViewpoints(scene.viewpoints, expected.viewpoints);
   });
 }
+
+test("without WebAssembly a file is refused, with what the page may do about it", () => {
+  const program = `delete globalThis.WebAssembly;
+    const { decode } = await import("${library}");
+    const { readFileSync } = await import("node:fs");
+    try { decode(readFileSync(0)); } catch ({ name, message }) { console.log(name, message); }`;
+  const { bytes } = goldenFiles()[0];
+  const { stdout } = spawnSync(process.execPath, ["--input-type=module", "-e", program], { input: bytes });
+  assert.match(`${stdout}`, /^MissingDependency kernels: .*WebAssembly.*'wasm-unsafe-eval'/);
+});
 
 function assertViewpoints(found, expected) {
   if (expected === null) return assert.equal(found, null);

@@ -7,7 +7,8 @@ import { fileURLToPath, pathToFileURL } from "node:url";
 
 /** The library as it was built: into CGS_BUILD, or dist. */
 const built = process.env.CGS_BUILD ?? fileURLToPath(new URL("../dist", import.meta.url));
-export const compgs = await import(pathToFileURL(join(built, "compgs.js")));
+export const library = pathToFileURL(join(built, "compgs.js"));
+export const compgs = await import(library);
 
 const GOLDEN = fileURLToPath(new URL("../../tests/golden", import.meta.url));
 /** Made by make_fixtures.py; without it only the golden files are looked at. */

@@ -70,7 +70,7 @@ test("of a file with more primitives than are wanted, its last range that is not
     [coarse + middle, coarse + middle],
     [coarse + middle + whole - 1, coarse + middle],
   ]) {
-    const decoder = new ProgressiveDecoder(undefined, most);
+    const decoder = new ProgressiveDecoder(most);
     let [needed, used] = [0, 0];
     for (const piece of pieces(bytes, 50)) {
       if (decoder.isFull) break;
@@ -83,7 +83,7 @@ test("of a file with more primitives than are wanted, its last range that is not
     assert.deepEqual(hashesOf(decoder.scene()), hashesOf(decode(bytes, { prefix: used })));
     assert.equal(decoder.push(bytes.subarray(needed)), false);
   }
-  const decoder = new ProgressiveDecoder(undefined, coarse + middle + whole);
+  const decoder = new ProgressiveDecoder(coarse + middle + whole);
   decoder.push(bytes);
   decoder.finish();
   assert.deepEqual(hashesOf(decoder.scene()), hashes);

@@ -19,8 +19,7 @@ import {
 } from "./encoding.mjs";
 import { compgs, goldenFiles } from "./fixtures.mjs";
 
-const { ProgressiveDecoder, decode, plainKernels, wasmKernels } = compgs;
-const KINDS = { "plain TypeScript": plainKernels, WebAssembly: await wasmKernels() };
+const { ProgressiveDecoder, decode, wasmKernels } = compgs;
 const [SCENE, POSITIONS, MASKS, TABLES, NETWORKS, HEADS, LATENTS] = [1, 2, 4, 5, 6, 7, 8];
 const [SIDE, REFERENCE, LOG_SCALES, RESIDUAL] = [0, 1, 2, 3];
 const MAX_SYMBOL = 2 ** 18;
@@ -64,55 +63,53 @@ function assertSame(found, expected) {
 
 const madeTables = (count, random) => Array.from({ length: count }, () => random(128));
 
-for (const [kind, kernels] of Object.entries(KINDS)) {
-  const decodes = (symbols, given, rows) => {
-    const used = shiftedTables(symbols, given, rows?.channels, rows?.inertia ?? 0, rows?.first);
-    const choices = Uint8Array.from(given);
-    const found = new Int32Array(symbols.length);
-    kernels.decodeChunk(chunkOf(symbols, used), kernelTables(), choices, found, rows, "latents");
-    const escaped = symbols.map((symbol, i) =>
-      Math.abs(symbol) > GAUSSIAN[used[i]].radius ? ESCAPED : symbol,
-    );
-    assertSame(found, escaped);
-    assertSame(choices, used);
-    return used;
-  };
+const decodes = (symbols, given, rows) => {
+  const used = shiftedTables(symbols, given, rows?.channels, rows?.inertia ?? 0, rows?.first);
+  const choices = Uint8Array.from(given);
+  const found = new Int32Array(symbols.length);
+  wasmKernels().decodeChunk(chunkOf(symbols, used), kernelTables(), choices, found, rows, "latents");
+  const escaped = symbols.map((symbol, i) =>
+    Math.abs(symbol) > GAUSSIAN[used[i]].radius ? ESCAPED : symbol,
+  );
+  assertSame(found, escaped);
+  assertSame(choices, used);
+  return used;
+};
 
-  test(`${kind}: tables shift by what a row has shown, and choices become those that were used`, () => {
-    const random = randomNumbers(1);
-    const shifts = new Set();
-    for (const channels of [2, 3, 7, 32, 256]) {
-      for (const inertia of [1, 2, 8, 63]) {
-        const given = madeTables(600, random);
-        const first = random(channels);
-        const symbols = madeSymbols(given, channels, random);
-        const used = decodes(symbols, given, { channels, inertia, first });
-        used.forEach((table, i) => shifts.add(table - given[i]));
-      }
+test("tables shift by what a row has shown, and choices become those that were used", () => {
+  const random = randomNumbers(1);
+  const shifts = new Set();
+  for (const channels of [2, 3, 7, 32, 256]) {
+    for (const inertia of [1, 2, 8, 63]) {
+      const given = madeTables(600, random);
+      const first = random(channels);
+      const symbols = madeSymbols(given, channels, random);
+      const used = decodes(symbols, given, { channels, inertia, first });
+      used.forEach((table, i) => shifts.add(table - given[i]));
     }
-    assert.ok(Math.min(...shifts) === -36 && Math.max(...shifts) > 20, `${[...shifts]}`);
-  });
+  }
+  assert.ok(Math.min(...shifts) === -36 && Math.max(...shifts) > 20, `${[...shifts]}`);
+});
 
-  test(`${kind}: a chunk of two states shifts as one does`, () => {
-    const random = randomNumbers(2);
-    const given = madeTables(2 ** 18 + 5, random);
-    decodes(madeSymbols(given, 11, random), given, { channels: 11, inertia: 3, first: 9 });
-  });
+test("a chunk of two states shifts as one does", () => {
+  const random = randomNumbers(2);
+  const given = madeTables(2 ** 18 + 5, random);
+  decodes(madeSymbols(given, 11, random), given, { channels: 11, inertia: 3, first: 9 });
+});
 
-  test(`${kind}: without rows every symbol has the table that the network gives`, () => {
-    const random = randomNumbers(3);
-    const given = madeTables(500, random);
-    assertSame(decodes(madeSymbols(given, 5, random), given, null), given);
-  });
+test("without rows every symbol has the table that the network gives", () => {
+  const random = randomNumbers(3);
+  const given = madeTables(500, random);
+  assertSame(decodes(madeSymbols(given, 5, random), given, null), given);
+});
 
-  test(`${kind}: chains and inertia of each role give the latents of a slow decoder`, () => {
-    const made = madeFile(GROUPS);
-    assertSame(latentsOf(decode(made.bytes, { kernels })), made.latents.flat());
-    const decoder = new ProgressiveDecoder(kernels);
-    decoder.push(made.bytes);
-    assertSame(latentsOf(decoder.scene()), made.latents.flat());
-  });
-}
+test("chains and inertia of each role give the latents of a slow decoder", () => {
+  const made = madeFile(GROUPS);
+  assertSame(latentsOf(decode(made.bytes)), made.latents.flat());
+  const decoder = new ProgressiveDecoder();
+  decoder.push(made.bytes);
+  assertSame(latentsOf(decoder.scene()), made.latents.flat());
+});
 
 /** What `madeFile` makes groups of: their networks give the same means and scales everywhere. */
 const GROUPS = [
@@ -254,13 +251,11 @@ function latentsSection({ anchors, coupled, head }, groups, random, latents) {
 const latentsOf = (scene) => scene.groups.flatMap((group) => [...group.latents]);
 
 function refuses(groups, message, changed) {
-  for (const kernels of Object.values(KINDS)) {
-    assert.throws(
-      () => decode(madeFile(groups, changed).bytes, { kernels }),
-      (thrown) => thrown.name === "CorruptSection" && message.test(thrown.message),
-      `${message}`,
-    );
-  }
+  assert.throws(
+    () => decode(madeFile(groups, changed).bytes),
+    (thrown) => thrown.name === "CorruptSection" && message.test(thrown.message),
+    `${message}`,
+  );
 }
 
 const withReference = (changed) => [{ role: REFERENCE, channels: 3, ...changed }, GROUPS[2]];

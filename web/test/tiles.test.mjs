@@ -7,7 +7,7 @@ import { join } from "node:path";
 import { test } from "node:test";
 import { FIXTURES, compgs, hashesOf } from "./fixtures.mjs";
 
-const { TileLoader, decode, plainKernels, planDetail, readManifest, sizeOf } = compgs;
+const { TileLoader, decode, planDetail, readManifest, sizeOf } = compgs;
 const CITY = join(FIXTURES, "city.tiles");
 const skip = !FIXTURES || !existsSync(CITY);
 const text = skip ? "" : readFileSync(join(CITY, "manifest.json"), "utf8");
@@ -59,7 +59,6 @@ function open(base, options = {}) {
   const errors = [];
   let resolve = null;
   const loader = new TileLoader(manifest, base, {
-    kernels: plainKernels,
     most: Infinity,
     onTile(tile, scene, shift, levels) {
       if (scene) scenes.set(tile, { scene, shift, levels });
@@ -249,7 +248,6 @@ test("a tile of another scene is refused, although its sections are whole", { sk
   const errors = [];
   await new Promise((resolve) => {
     const loader = new TileLoader(other, base, {
-      kernels: plainKernels,
       most: Infinity,
       onTile() {},
       onSharp: resolve,

@@ -1,7 +1,5 @@
 /** The worker: decodes a scene as it arrives, predicts its splats, and sorts them for the camera at hand. */
 
-import { chooseKernels } from "../src/choose_kernels.ts";
-import type { Kernels } from "../src/codec/kernels.ts";
 import type { Scene } from "../src/codec/scene_decoder.ts";
 import { Predictor } from "../src/prediction/predictor.ts";
 import { ProgressiveDecoder } from "../src/progressive.ts";
@@ -26,7 +24,6 @@ declare const self: {
   postMessage(message: FromWorker, transfer?: Transferable[]): void;
 };
 
-const kernels = chooseKernels();
 /** Of the scene that is shown. */
 let store = newStore();
 let tiles: TileLoader | null = null;
@@ -103,8 +100,7 @@ async function open(
 ): Promise<void> {
   let head = NO_BYTES;
   try {
-    const chosen = await kernels;
-    const decoder = new ProgressiveDecoder(chosen, most);
+    const decoder = new ProgressiveDecoder(most);
     const reader = stream.getReader();
     let loaded = 0;
     for (;;) {
@@ -115,14 +111,14 @@ async function open(
         head = value.slice(0, HEAD);
         if (base && isManifest(text(value))) {
           const manifest = readManifest(text(await restOf(reader, value)));
-          if (ticket === opened) openTiles(ticket, manifest, base, most, chosen);
+          if (ticket === opened) openTiles(ticket, manifest, base, most);
           return;
         }
       }
       loaded += value.length;
       const isFiner = decoder.push(value);
       self.postMessage({ kind: "progress", loaded, total: total ?? decoder.expectedBytes });
-      if (isFiner) show(decoder.scene(), chosen);
+      if (isFiner) show(decoder.scene());
       if (decoder.isFull) {
         void reader.cancel().catch(() => {}); // nothing that is still to come is shown
         break;
@@ -154,8 +150,8 @@ function report(ticket: number, error: unknown, head: Uint8Array): void {
   self.postMessage({ kind: "error", name, message, head });
 }
 
-function show(scene: Scene, chosen: Kernels): void {
-  const predictor = new Predictor(scene, chosen);
+function show(scene: Scene): void {
+  const predictor = new Predictor(scene);
   const info = sceneInfo(scene, predictor);
   const first = firstView(predictor.positions, info.viewpoints, info.extent);
   if (isOfTiles) {
@@ -168,14 +164,13 @@ function show(scene: Scene, chosen: Kernels): void {
 }
 
 /** Shows a scene of tiles: at first nothing but where it is, then what the camera needs. */
-function openTiles(ticket: number, manifest: Manifest, base: string, most: number, chosen: Kernels): void {
+function openTiles(ticket: number, manifest: Manifest, base: string, most: number): void {
   const levels = new Int32Array(manifest.tiles.length);
   const loader = new TileLoader(manifest, base, {
-    kernels: chosen,
     most,
     onTile(tile, scene, shift, level) {
       levels[tile] = level;
-      if (scene) parts.set(tile, new Predictor(scene, chosen), shift);
+      if (scene) parts.set(tile, new Predictor(scene), shift);
       else parts.delete(tile);
       self.postMessage({ kind: "counts", ...countsOf(manifest, levels) });
     },

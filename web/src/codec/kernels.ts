@@ -1,7 +1,4 @@
-/**
- * The loops that take the time, behind one interface: in plain TypeScript (plain_kernels.ts), which is the readable
- * truth, and in WebAssembly (wasm_kernels.ts), which is compared with it.
- */
+/** The loops that take the time, which are in WebAssembly (assembly/), as the rest of the decoder sees them. */
 
 import type { IntegerNetwork } from "./networks.ts";
 import type { ChunkRows } from "./rows.ts";
@@ -50,11 +47,8 @@ export interface Kernels {
   /** Outputs [rows, outputs] of a network for inputs [rows, inputs], Q12. */
   evaluate(network: IntegerNetwork, inputs: Int32Array, rows: number): Int32Array;
 
-  /**
-   * Outputs [P, outputs] of a residual MLP for the coupled primitives of some anchors, in place of the loop of
-   * src/prediction/coupled_mlp.ts. Absent: that loop runs.
-   */
-  runCoupled?(mlp: PackedMLP, task: CoupledTask): Float32Array;
+  /** Outputs [P, outputs] of a residual MLP for the coupled primitives of some anchors. */
+  runCoupled(mlp: PackedMLP, task: CoupledTask): Float32Array;
 }
 
 /** A residual MLP whose widths are padded by zeros: hidden ones to a multiple of 16, outputs to one of 4. */

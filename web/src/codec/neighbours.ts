@@ -1,8 +1,7 @@
 /** What anchors of earlier ranges have around those of a range (docs/bitstream.md, "Neighbours"). */
 
 import { FRACTION_BITS, NEAREST_WEIGHT } from "./constants.ts";
-import { clampActivation } from "./network_evaluation.ts";
-import type { Follow } from "./networks.ts";
+import { type Follow, clampActivation } from "./networks.ts";
 
 /** Numbers that a network takes of an anchor's neighbours: known, activity. */
 export const NEIGHBOUR_INPUTS = 2;

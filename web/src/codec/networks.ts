@@ -68,6 +68,11 @@ interface NetworkHead extends Omit<IntegerNetwork, "layers" | "follow" | "chain"
   channels: number;
 }
 
+/** An activation within its limits: all sums of them are integers that doubles hold. */
+export function clampActivation(x: number): number {
+  return Math.max(-ACTIVATION_LIMIT, Math.min(ACTIVATION_LIMIT - 1, x));
+}
+
 /** For each group its network, or null; and the number of all elements of their weights. */
 export function readNetworks(
   payload: Uint8Array,

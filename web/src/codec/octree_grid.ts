@@ -25,10 +25,7 @@ function masksOf(bits: number[]): Cells {
 const along = (d: number, half: number): number => 1 + 2 * d + half;
 
 /** Of neighbour j and its child c: the bit of the cell, or -1 outside of the grid. */
-export const CELL_OF_CHILD = new Int8Array(27 * 8);
-/** Of neighbour j: bits of all its children within the grid. */
-export const NEIGHBOUR_LOW = new Int32Array(27);
-export const NEIGHBOUR_HIGH = new Int32Array(27);
+const CELL_OF_CHILD = new Int8Array(27 * 8);
 /** Of an occupancy byte of neighbour j: bits of its occupied children within the grid. */
 export const OCCUPIED_LOW = new Int32Array(27 * 256);
 export const OCCUPIED_HIGH = new Int32Array(27 * 256);
@@ -45,8 +42,6 @@ for (let j = 0; j < 27; j++) {
     OCCUPIED_LOW[256 * j + occupancy] = cells.low;
     OCCUPIED_HIGH[256 * j + occupancy] = cells.high;
   }
-  NEIGHBOUR_LOW[j] = OCCUPIED_LOW[256 * j + 255]!;
-  NEIGHBOUR_HIGH[j] = OCCUPIED_HIGH[256 * j + 255]!;
 }
 
 /** Of child c: the 26 cells around it, as masks. */
@@ -59,8 +54,6 @@ export const TOUCHING = new Uint8Array(8 * 7);
 /** Of child c and direction j: which node (0 to 26) and which of its children the neighbouring cell is. */
 export const STEP_NODE = new Uint8Array(8 * 27);
 export const STEP_CHILD = new Uint8Array(8 * 27);
-/** The node's own face neighbours among the 27: -x, +x, -y, +y, -z, +z. */
-export const FACE_NODES = [4, 22, 10, 16, 12, 14] as const;
 
 for (let c = 0; c < 8; c++) {
   const half = [c >> 2, (c >> 1) & 1, c & 1] as const;
@@ -97,10 +90,4 @@ for (let c = 0; c < 8; c++) {
     const d = used.map((u, axis) => u * side[axis]!);
     TOUCHING[7 * c + k] = 9 * (d[0]! + 1) + 3 * (d[1]! + 1) + d[2]! + 1;
   });
-}
-
-export function countBits(x: number): number {
-  x -= (x >>> 1) & 0x55555555;
-  x = (x & 0x33333333) + ((x >>> 2) & 0x33333333);
-  return Math.imul((x + (x >>> 4)) & 0x0f0f0f0f, 0x01010101) >>> 24;
 }

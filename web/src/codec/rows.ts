@@ -9,14 +9,12 @@
 import {
   CHAIN_BITS,
   FRACTION_BITS,
-  GAUSSIAN_COUNT,
   LARGEST_TABLE_SHIFT,
   MAX_SYMBOL,
   SIZE_CAP,
   SIZE_OFFSET,
 } from "./constants.ts";
 import type { FieldReader } from "./fields.ts";
-import { ESCAPED } from "./kernels.ts";
 import { gaussianTables } from "./tables.ts";
 
 const ONE = 1 << FRACTION_BITS;
@@ -96,53 +94,6 @@ function expectedSizes(): number[] {
     for (let q = 1; q <= radius; q++) sum += q * frequencies[first + radius + q]!;
     return Math.floor(sum / 8); // two sides, 4096 in units of 2^-16
   });
-}
-
-/** How far the tables of a row are shifted, symbol by symbol. */
-export class TableShift {
-  private readonly tables = rowTables();
-  private readonly channels: number;
-  /** What both sums are at the beginning of a row: what the network expects counts as so many symbols. */
-  private readonly start: number;
-  private column: number;
-  private seen: number;
-  private expected: number;
-  private shift = 0;
-
-  constructor({ channels, inertia, first }: ChunkRows) {
-    this.channels = channels;
-    this.column = first;
-    this.seen = this.expected = this.start = ONE * inertia;
-  }
-
-  /** What the next symbol's table, as the network gives it, becomes. */
-  shifted(table: number): number {
-    return Math.max(0, Math.min(GAUSSIAN_COUNT - 1, table + this.shift));
-  }
-
-  /** Takes that symbol, or ESCAPED, into account; `table` is as the network gives it. */
-  learn(table: number, symbol: number): void {
-    if (++this.column === this.channels) {
-      this.column = this.shift = 0;
-      this.seen = this.expected = this.start;
-      return;
-    }
-    const { expected, seen, seenBase } = this.tables;
-    const most = seenBase[table + 1]! - 1;
-    this.seen += seen[symbol === ESCAPED ? most : Math.min(most, seenBase[table]! + Math.abs(symbol))]!;
-    this.expected += expected[table]!;
-    this.follow();
-  }
-
-  /** The largest shift whose ratio is reached, looked for from the last one on: it seldom moves far. */
-  private follow(): void {
-    const { ratios } = this.tables;
-    const scaled = RATIO_ONE * this.seen;
-    let i = this.shift + LARGEST_TABLE_SHIFT;
-    while (i < ratios.length - 1 && scaled >= this.expected * ratios[i + 1]!) i++;
-    while (i > 0 && scaled < this.expected * ratios[i]!) i--;
-    this.shift = i - LARGEST_TABLE_SHIFT;
-  }
 }
 
 /** Steps between latents and means, of symbols [rows, channels]. */

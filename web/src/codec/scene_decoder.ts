@@ -4,11 +4,11 @@
  */
 
 import { CorruptSection, MissingDependency } from "../errors.ts";
+import { wasmKernels } from "../wasm_kernels.ts";
 import { canonicalOrder, standsFor } from "./anchor_order.ts";
 import { type Section, SectionNumber } from "./container.ts";
 import { FieldReader } from "./fields.ts";
 import { type Tensor, readHeads } from "./heads.ts";
-import type { Kernels } from "./kernels.ts";
 import {
   type EarlierRanges,
   type GroupLatents,
@@ -88,6 +88,7 @@ export class SceneDecoder {
   private anchors = 0;
   /** Coupled primitives that are there. */
   coupled = 0;
+  private readonly kernels = wasmKernels();
   private viewpoints: Viewpoints | null = null;
   private metadata = new Map<string, string>();
 
@@ -96,13 +97,8 @@ export class SceneDecoder {
    *
    * `bytes`: length of the file, or of what has arrived of it; `whole`: whether all anchors will be decoded.
    */
-  constructor(
-    version: number,
-    sections: Section[],
-    private readonly kernels: Kernels,
-    bytes: number,
-    whole: boolean,
-  ) {
+  constructor(version: number, sections: Section[], bytes: number, whole: boolean) {
+    const { kernels } = this;
     const find = (number: number): Section | undefined => sections.find((s) => s.number === number);
     const [scene, positions, masks] = [SectionNumber.scene, SectionNumber.positions, SectionNumber.masks].map(
       find,

@@ -1,6 +1,5 @@
 /** The worker of a live scene: decodes a file as it arrives, and predicts colors for the camera at hand. */
 
-import { chooseKernels } from "../choose_kernels.ts";
 import { type Appearance, Predictor } from "../prediction/predictor.ts";
 import { ProgressiveDecoder } from "../progressive.ts";
 import { type SceneInfo, sceneInfo } from "../scene_info.ts";
@@ -18,7 +17,6 @@ declare const self: {
   postMessage(message: FromWorker, transfer?: Transferable[]): void;
 };
 
-const chosen = chooseKernels();
 let decoder: ProgressiveDecoder | null = null;
 let layout: Layout = "arrays";
 let shown: Shown | null = null;
@@ -39,7 +37,7 @@ async function answer(message: Exclude<ToWorker, { kind: "eye" }>): Promise<void
   else if (message.kind === "end") finish();
   else {
     layout = message.layout;
-    decoder = new ProgressiveDecoder(await chosen, message.most);
+    decoder = new ProgressiveDecoder(message.most);
     if (message.url !== null) await openUrl(message.url);
   }
 }
@@ -65,7 +63,7 @@ async function take(piece: Uint8Array, total: number | null): Promise<void> {
   self.postMessage({ kind: "progress", loaded, total: total ?? decoder!.expectedBytes });
   if (!isFiner) return;
   const scene = decoder!.scene();
-  const predictor = new Predictor(scene, await chosen);
+  const predictor = new Predictor(scene);
   shown = { predictor, appearance: predictor.newAppearance() };
   show(shown, sceneInfo(scene, predictor));
 }

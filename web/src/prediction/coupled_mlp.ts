@@ -9,8 +9,6 @@ import type { Kernels, PackedMLP } from "../codec/kernels.ts";
 import type { HeadNetwork } from "./head_networks.ts";
 import type { CoupledPrimitives } from "./scene_values.ts";
 
-const SLOPE = 1 / 64;
-
 /** Entries [rows, width] of the first layer and [rows, outputs] of the skip. */
 interface Partial {
   rows: number;
@@ -27,7 +25,7 @@ export class CoupledMLP {
   private readonly viewRow: number;
   private readonly residualRow: number;
 
-  private readonly packed: PackedMLP | null;
+  private readonly packed: PackedMLP;
 
   constructor(
     readonly network: HeadNetwork,
@@ -58,7 +56,7 @@ export class CoupledMLP {
     };
     const shared = primitives.sharedResiduals;
     this.ofSlots = shared && this.partOfResiduals(shared);
-    this.packed = kernels.runCoupled ? this.pack() : null;
+    this.packed = this.pack();
   }
 
   private pack(): PackedMLP {
@@ -92,14 +90,13 @@ export class CoupledMLP {
     };
   }
 
-  /** `run` by a kernel: the anchors' parts, the view's included, are made here. */
-  private runPacked(
-    mlp: PackedMLP,
-    first: number,
-    end: number,
-    views: Float32Array | null,
-    out: Float32Array,
-  ): void {
+  /**
+   * Outputs [P, outputs] of the coupled primitives of anchors first ... end - 1, into `out`, which is that of all.
+   * `views` [N, 4]: the view embeddings, for networks that see the view. The anchors' parts are made here, the rest by a
+   * kernel.
+   */
+  run(first: number, end: number, views: Float32Array | null, out: Float32Array): void {
+    const mlp = this.packed;
     const { firstCoupled, slots, residuals, residualDim } = this.primitives;
     const { width, outputs, inputWeight, skipWeight } = this.network;
     const anchors = end - first;
@@ -122,7 +119,7 @@ export class CoupledMLP {
     fill(entries, mlp.width, this.ofAnchors.entry, width, inputWeight);
     fill(skips, mlp.padded, this.ofAnchors.skip, outputs, skipWeight);
     const [from, to] = [firstCoupled[first]!, firstCoupled[end]!];
-    const found = this.kernels.runCoupled!(mlp, {
+    const found = this.kernels.runCoupled(mlp, {
       anchors,
       entries,
       skips,
@@ -143,57 +140,6 @@ export class CoupledMLP {
       skip: product(residuals, residualDim, skipWeight, this.residualRow, outputs, null),
     };
   }
-
-  /**
-   * Outputs [P, outputs] of the coupled primitives of anchors first ... end - 1, into `out`, which is that of all.
-   * `views` [N, 4]: the view embeddings, for networks that see the view.
-   */
-  run(first: number, end: number, views: Float32Array | null, out: Float32Array): void {
-    if (this.packed) return this.runPacked(this.packed, first, end, views, out);
-    const { firstCoupled, slots, residuals, residualDim } = this.primitives;
-    const { width, outputs, inputWeight, skipWeight } = this.network;
-    const entry = new Float64Array(width);
-    const skip = new Float64Array(outputs);
-    const state = new Float64Array(width);
-    const inner = new Float64Array(width);
-    for (let n = first; n < end; n++) {
-      for (let i = 0; i < width; i++) entry[i] = this.ofAnchors.entry[n * width + i]!;
-      for (let i = 0; i < outputs; i++) skip[i] = this.ofAnchors.skip[n * outputs + i]!;
-      if (views) {
-        addProduct(views, 4 * n, 4, inputWeight, this.viewRow, width, entry);
-        addProduct(views, 4 * n, 4, skipWeight, this.viewRow, outputs, skip);
-      }
-      const [from, to] = [firstCoupled[n]!, firstCoupled[n + 1]!];
-      const own =
-        this.ofSlots ?? this.partOfResiduals(residuals!.subarray(from * residualDim, to * residualDim));
-      for (let p = from; p < to; p++) {
-        const row = this.ofSlots ? slots[p]! : p - from;
-        for (let i = 0; i < width; i++) state[i] = leaky(entry[i]! + own.entry[row * width + i]!);
-        this.applyBlocks(state, inner);
-        for (let o = 0; o < outputs; o++) {
-          let sum = skip[o]! + own.skip[row * outputs + o]!;
-          for (let i = 0; i < width; i++) sum += state[i]! * this.network.outputWeight[i * outputs + o]!;
-          out[p * outputs + o] = sum;
-        }
-      }
-    }
-  }
-
-  private applyBlocks(state: Float64Array, inner: Float64Array): void {
-    const { width, blocks } = this.network;
-    for (const { weight1, bias1, weight2, bias2 } of blocks) {
-      inner.set(bias1);
-      for (let i = 0; i < width; i++) {
-        const x = state[i]!;
-        for (let j = 0; j < width; j++) inner[j]! += x * weight1[i * width + j]!;
-      }
-      for (let i = 0; i < width; i++) {
-        const x = leaky(inner[i]!);
-        for (let j = 0; j < width; j++) state[j]! += x * weight2[i * width + j]!;
-      }
-      for (let j = 0; j < width; j++) state[j]! += bias2[j]!;
-    }
-  }
 }
 
 function roundedUp(count: number, unit: number): number {
@@ -207,10 +153,6 @@ function paddedRows(values: Float32Array, columns: number, rows: number, width: 
     result.set(values.subarray(row * columns, (row + 1) * columns), row * width);
   }
   return result;
-}
-
-function leaky(x: number): number {
-  return x < 0 ? x * SLOPE : x;
 }
 
 /** [rows, columns] of x [rows, inputs] times the rows of `weight` from `firstRow` on, plus `bias`. */

@@ -1,8 +1,7 @@
 /** From a scene to the Gaussians that a camera sees (docs/bitstream_prediction.md). */
 
-import type { Kernels } from "../codec/kernels.ts";
-import { plainKernels } from "../codec/plain_kernels.ts";
 import type { Scene } from "../codec/scene_decoder.ts";
+import { wasmKernels } from "../wasm_kernels.ts";
 import { CoupledMLP } from "./coupled_mlp.ts";
 import { readHeadNetworks } from "./head_networks.ts";
 import { type CoupledPrimitives, anchorLengths, coupledPrimitives } from "./scene_values.ts";
@@ -43,10 +42,8 @@ export class Predictor {
   private readonly views: Float32Array;
   private readonly raw: Float32Array[];
 
-  constructor(
-    private readonly scene: Scene,
-    kernels: Kernels = plainKernels,
-  ) {
+  constructor(private readonly scene: Scene) {
+    const kernels = wasmKernels();
     const { networks, sharedResiduals } = readHeadNetworks(scene);
     this.primitives = coupledPrimitives(scene, sharedResiduals);
     this.positions = Float32Array.from(scene.coordinates, (c) => c * scene.voxelSize);

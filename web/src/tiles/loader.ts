@@ -3,7 +3,6 @@
  * and shown, the coarsest tile first. No byte is asked for twice; what is not shown keeps its bytes, which are few.
  */
 
-import type { Kernels } from "../codec/kernels.ts";
 import type { Scene } from "../codec/scene_decoder.ts";
 import { CorruptSection, TruncatedSection } from "../errors.ts";
 import { ProgressiveDecoder } from "../progressive.ts";
@@ -19,7 +18,6 @@ const MOST_TRIES = 3;
 const PAUSE = 500;
 
 export interface TileLoaderOptions {
-  kernels: Kernels;
   /** Splats of all tiles together. */
   most: number;
   /**
@@ -199,11 +197,11 @@ export class TileLoader {
 
   private show(index: number, level: number): void {
     const tile = this.tiles[index]!;
-    const { onTile, kernels } = this.options;
+    const { onTile } = this.options;
     try {
       let scene: Scene | null = null;
       if (level) {
-        tile.decoder ??= new ProgressiveDecoder(kernels);
+        tile.decoder ??= new ProgressiveDecoder();
         const { bytes } = tile.entry.levels[level - 1]!;
         for (const piece of between(tile.pieces, tile.decoded, bytes)) tile.decoder.push(piece);
         tile.decoded = bytes;
