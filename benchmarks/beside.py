@@ -5,15 +5,16 @@
 
 The rows: the .cgs file; the .spz and .sog that `compgs export` makes of it; with --plain (from `compgs train --method
 3dgs`) the same splats as .spz and .sog, and four of five of them pruned, the others settled for --settle steps (the
-methods pruned-spz and pruned-sog). Bytes are those of the files; PSNR, SSIM and LPIPS those of `compgs evaluate` on
-the held-out views. Milliseconds are from the beginning of a page to the first picture with anything in it, and to the
-last change of the picture, in a headless Chromium that draws with Spark by software, while the file comes at --mbit
-megabits a second: medians of --times visits. "Drawn" compares the last picture with this program's of the same file.
-What OUT has already is not made again. Needs Node and the packages of web/ (`make web`), chromium and the Python
-package websockets.
+methods pruned-spz and pruned-sog). Without --plain the table says that these are missing. Bytes are those of the files;
+PSNR, SSIM and LPIPS those of `compgs evaluate` on the held-out views; a file in the folder of its run is not measured
+again. Milliseconds are from the beginning of a page to the first picture with anything in it, and to the last change of
+the picture, in a headless Chromium that draws with Spark by software, while the file comes at --mbit megabits a second:
+medians of --times visits. "Drawn" compares the last picture with this program's of the same file. What OUT has already
+is not made again. Needs Node and the packages of web/ (`make web`), chromium and the Python package websockets.
 """
 
 import argparse
+import hashlib
 import http.server
 import json
 import shutil
@@ -85,6 +86,11 @@ renderer.setAnimationLoop(() => {
 """
 
 
+# Rows that need the splats of plain 3DGS: names, and files in OUT without their ending.
+PLAIN = (("3DGS", "3dgs"), ("3DGS pruned to a fifth", "pruned"))
+KINDS = ("spz", "sog")
+
+
 @dataclass(frozen=True)
 class Entry:
     """One row: a file, and where it came from."""
@@ -119,6 +125,8 @@ def main() -> None:
         {"name": e.name, "file": e.file.name, **m, **s}
         for e, m, s in zip(entries, measured, shown, strict=True)
     ]
+    if options.plain is None:
+        rows += [{"name": f"{name}, `.{kind}`", "missing": True} for name, _ in PLAIN for kind in KINDS]
     (options.output / "beside.json").write_text(json.dumps(rows, indent=1) + "\n")
     print(table(rows))
 
@@ -130,20 +138,19 @@ def files(options: argparse.Namespace) -> Iterator[Entry]:
     ply = out / "ours.ply"
     if not ply.is_file():
         compgs.export(options.ours, ply, refine=options.refine)
-    for kind in ("spz", "sog"):
+    for kind in KINDS:
         yield Entry(f"ours, exported to `.{kind}`", written(ply, out / f"ours.{kind}"))
     if options.plain is None:
         return
-    for kind in ("spz", "sog"):
-        yield Entry(f"3DGS, `.{kind}`", written(options.plain, out / f"3dgs.{kind}"))
     pruned = out / "pruned.ply"
     if not pruned.is_file():
         config = replace(settings_of("pruned-spz"), pruned=PrunedSection(settled=1.0))  # type: ignore[call-arg]
         config = replace(config, training=replace(config.training, steps=options.settle))
         model = train(read(options), config, method="pruned-spz", splats=options.plain)
         compgs.export(model, pruned)
-    for kind in ("spz", "sog"):
-        yield Entry(f"3DGS pruned to a fifth, `.{kind}`", written(pruned, out / f"pruned.{kind}"))
+    for (name, stem), splats in zip(PLAIN, (options.plain, pruned), strict=True):
+        for kind in KINDS:
+            yield Entry(f"{name}, `.{kind}`", written(splats, out / f"{stem}.{kind}"))
 
 
 def written(source: Path, target: Path) -> Path:
@@ -159,11 +166,20 @@ def read(options: argparse.Namespace) -> Any:
 
 def measures(entry: Entry, options: argparse.Namespace) -> dict[str, Any]:
     """Bytes and quality of a file on the held-out views."""
-    folder = options.output / "evaluation" / entry.file.name
-    if not (folder / "results.json").is_file():
-        compgs.evaluate(entry.file, read(options), output=folder, lpips=options.lpips_weights or False)
-    results = json.loads((folder / "results.json").read_text())
+    results = of_its_run(entry.file)
+    if results is None or (options.lpips_weights and results["lpips"] is None):
+        folder = options.output / "evaluation" / entry.file.name
+        if not (folder / "results.json").is_file():
+            compgs.evaluate(entry.file, read(options), output=folder, lpips=options.lpips_weights or False)
+        results = json.loads((folder / "results.json").read_text())
     return {name: results[name] for name in ("bytes", "psnr", "ssim", "lpips", "lpips_3dgs")}
+
+
+def of_its_run(file: Path) -> dict[str, Any] | None:
+    """What the run that made a file has measured of it; None if it is in no run's folder, or another file."""
+    path = file.parent / "results.json"
+    results = json.loads(path.read_text()) if path.is_file() else {}
+    return results if results.get("sha256") == hashlib.sha256(file.read_bytes()).hexdigest() else None
 
 
 def in_browser(entries: list[Entry], model: Any, options: argparse.Namespace) -> list[dict[str, float]]:
@@ -302,6 +318,9 @@ def table(rows: list[dict[str, Any]]) -> str:
         "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for row in rows:
+        if row.get("missing"):
+            lines.append(f"| {row['name']} | missing | | | | | | | |")
+            continue
         lpips = "" if row["lpips_3dgs"] is None else f"{row['lpips_3dgs']:.3f}"
         first, last = (f"{row[name]:,.0f}" if name in row else "" for name in ("first_ms", "last_ms"))
         drawn = f"{row['drawn_db']:.1f}" if "drawn_db" in row else ""
