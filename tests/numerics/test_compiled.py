@@ -1,4 +1,4 @@
-"""Kernels are compiled when they are called, by one clock; parallel ones share their work among threads."""
+"""Kernels are compiled when they are called, by one clock; parallel ones divide their work among threads."""
 
 import os
 import threading
@@ -11,9 +11,9 @@ import pytest
 
 from compgs.cli import compiling as announcing
 from compgs.numerics import kernel_cache
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.numerics.compiling import COMPILING, CompilingTime, working_seconds
-from compgs.numerics.crew import CREW, Crew, Share
+from compgs.numerics.threads import THREADS, Part, Threads
 
 
 @pytest.fixture(autouse=True)
@@ -79,9 +79,9 @@ def test_constants_in_a_call_make_no_kernel_of_their_own() -> None:
 
 
 @njit(parallel=True)
-def fill(out, share):
-    for i in portion(len(out), share):
-        out[i] += 10 * share[1] + share[0]
+def fill(out, part):
+    for i in chunk_of(len(out), part):
+        out[i] += 10 * part[1] + part[0]
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def filled(count: int) -> np.ndarray:
     return out
 
 
-def test_a_parallel_kernel_does_all_of_its_work_once_in_contiguous_shares(threads: int) -> None:
+def test_a_parallel_kernel_does_all_of_its_work_once_in_contiguous_parts(threads: int) -> None:
     for count in (0, 1, threads, 1000):
         expected = 10 * threads + np.arange(threads).repeat(
             [count * (i + 1) // threads - count * i // threads for i in range(threads)]
@@ -109,7 +109,7 @@ def test_a_parallel_kernel_does_all_of_its_work_once_in_contiguous_shares(thread
         assert filled(count).tolist() == expected.tolist()
 
 
-def test_on_one_thread_there_is_one_share() -> None:
+def test_on_one_thread_there_is_one_part() -> None:
     before = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
@@ -131,61 +131,61 @@ def test_several_threads_may_call_parallel_kernels_at_once(threads: int) -> None
     assert results == 800 * [filled(100).sum()]
 
 
-def test_an_error_in_any_share_reaches_the_caller_when_all_shares_have_ended() -> None:
+def test_an_error_in_any_part_reaches_the_caller_when_all_parts_have_ended() -> None:
     ended = []
 
-    def work(share: Share) -> None:
-        if share[0] == failing:
-            raise ValueError(f"share {share[0]}")
+    def work(part: Part) -> None:
+        if part[0] == failing:
+            raise ValueError(f"part {part[0]}")
         time.sleep(0.05)
-        ended.append(share[0])
+        ended.append(part[0])
 
     for failing in range(3):
         ended.clear()
-        with pytest.raises(ValueError, match=f"share {failing}"):
-            Crew().do(work, 3)
+        with pytest.raises(ValueError, match=f"part {failing}"):
+            Threads().do(work, 3)
         assert sorted(ended) == [i for i in range(3) if i != failing]
 
 
 @pytest.mark.parametrize("failing", [(0, 1, 2), (1, 2), (2,)])
-def test_of_several_errors_the_caller_gets_that_of_the_first_share(failing: tuple[int, ...]) -> None:
-    def work(share: Share) -> None:
-        time.sleep(0.02 * (3 - share[0]))  # the last fails first
-        if share[0] in failing:
-            raise ValueError(f"share {share[0]}")
+def test_of_several_errors_the_caller_gets_that_of_the_first_part(failing: tuple[int, ...]) -> None:
+    def work(part: Part) -> None:
+        time.sleep(0.02 * (3 - part[0]))  # the last fails first
+        if part[0] in failing:
+            raise ValueError(f"part {part[0]}")
 
-    with pytest.raises(ValueError, match=f"share {failing[0]}"):
-        Crew().do(work, 3)
+    with pytest.raises(ValueError, match=f"part {failing[0]}"):
+        Threads().do(work, 3)
 
 
 def test_two_tasks_meet_on_two_threads(threads: int) -> None:
     meeting = threading.Barrier(2, timeout=20)
-    assert sorted(Crew().both(meeting.wait, meeting.wait)) == [0, 1]
+    assert sorted(Threads().both(meeting.wait, meeting.wait)) == [0, 1]
 
 
 def test_on_one_thread_two_tasks_come_one_after_the_other_and_an_error_ends_both(threads: int) -> None:
     came: list[int] = []
     numba.set_num_threads(1)  # (`threads` sets it back)
-    Crew().both(lambda: came.append(threading.get_ident()), lambda: came.append(threading.get_ident()))
+    Threads().both(lambda: came.append(threading.get_ident()), lambda: came.append(threading.get_ident()))
     assert came == [threading.get_ident()] * 2
     with pytest.raises(ZeroDivisionError):
-        Crew().both(lambda: 1 // 0, lambda: came.append(0))
+        Threads().both(lambda: 1 // 0, lambda: came.append(0))
     assert len(came) == 2
 
 
-def test_tasks_of_a_crew_may_call_parallel_kernels(threads: int) -> None:
-    """Members share nothing further: as many tasks as members, each waiting for another, would never end."""
-    first, second = CREW.both(lambda: filled(100), lambda: filled(100))
+def test_tasks_of_threads_may_call_parallel_kernels(threads: int) -> None:
+    """They divide nothing further: as many tasks as threads, each waiting for another, would never end."""
+    first, second = THREADS.both(lambda: filled(100), lambda: filled(100))
     assert first.tolist() == filled(100).tolist() and second.tolist() == [10] * 100
 
 
-@njit(parallel=True, worth=lambda out: len(out) // 4)
-def fill_large(out, share):
-    for i in portion(len(out), share):
-        out[i] += 10 * share[1] + share[0]
+@njit(parallel=True, max_threads=lambda out: len(out) // 4)
+def fill_large(out, part):
+    for i in chunk_of(len(out), part):
+        out[i] += 10 * part[1] + part[0]
 
 
-def test_a_call_that_is_not_worth_it_is_not_shared(threads: int) -> None:
+def test_a_call_that_is_not_worth_it_is_not_divided(threads: int) -> None:
     small, large = np.zeros(7, np.int64), np.zeros(4 * threads, np.int64)
     fill_large(small)
     fill_large(large)

@@ -204,7 +204,7 @@ def _squashed(logit: Int) -> Int:
     return np.int64(SQUASH[np.uint64(logit + 2048)])
 
 
-@njit(apart=True)
+@njit(no_alias=True)
 def mixed_bit(
     coder: NDArray[np.int64],
     data: NDArray[np.uint8],

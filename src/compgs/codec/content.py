@@ -40,7 +40,7 @@ from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 from compgs.model.constants import SHARED_RESIDUALS
 from compgs.model.head_weights import HeadDimensions, weight_shapes
-from compgs.numerics.compiled import njit, portion, rows_a_thread
+from compgs.numerics.compiled import chunk_of, njit, rows_a_thread
 from compgs.ordering.neighbours import BESIDES, Neighbours, find_neighbours
 from compgs.ordering.order import level_counts, octree_depth, octree_origin
 from compgs.ordering.ranges import chosen_levels
@@ -316,15 +316,15 @@ def scatter_existing(existing: np.ndarray, mask: np.ndarray) -> np.ndarray:  # [
     return slots
 
 
-@njit(parallel=True, worth=rows_a_thread(1 << 17))  # 30 microseconds
-def _add_steps(steps, means, share):
-    for i in portion(len(steps), share):
+@njit(parallel=True, max_threads=rows_a_thread(1 << 17))  # 30 microseconds
+def _add_steps(steps, means, part):
+    for i in chunk_of(len(steps), part):
         means[i] += steps[i] << FRACTION_BITS
 
 
 @njit(parallel=True)
-def _move_rows(slots, existing, mask, rows, gather, share):
-    for n in portion(len(mask), share):
+def _move_rows(slots, existing, mask, rows, gather, part):
+    for n in chunk_of(len(mask), part):
         row = rows[n]
         for k in range(mask.shape[1]):
             if not mask[n, k]:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compgs.codec.rows import NOTHING, RowContext
-from compgs.numerics.compiled import njit, portion, rows_a_thread
+from compgs.numerics.compiled import chunk_of, njit, rows_a_thread
 
 FRACTION_BITS = 12
 ACTIVATION_LIMIT = 1 << 23  # activations are in [-2^23, 2^23 - 1]
@@ -165,10 +165,10 @@ def follow_neighbours(network: IntegerNetwork, around: np.ndarray, means: np.nda
     _follow(follow.weight.astype(np.int64), half, follow.shift, centre_of(network), around, means)
 
 
-@njit(parallel=True, worth=rows_a_thread(2048))
-def _follow(weight, half, shift, centre, around, means, share):
+@njit(parallel=True, max_threads=rows_a_thread(2048))
+def _follow(weight, half, shift, centre, around, means, part):
     rounding = 1 << (FRACTION_BITS - 1)
-    for n in portion(len(means), share):
+    for n in chunk_of(len(means), part):
         for c in range(len(weight)):
             moved = np.int64(means[n, c]) - centre[c] + ((weight[c] * around[n, c] + half) >> shift)
             mean = centre[c] + (((moved + rounding) >> FRACTION_BITS) << FRACTION_BITS)
@@ -238,12 +238,12 @@ def _activation(a, bias, half, scale, rectify):
     return min(max(y, -float(ACTIVATION_LIMIT)), float(ACTIVATION_LIMIT - 1))
 
 
-@njit(parallel=True, worth=rows_a_thread(512))
-def _layer(x, weight, bias, shift, rectify, added, out, share):
+@njit(parallel=True, max_threads=rows_a_thread(512))
+def _layer(x, weight, bias, shift, rectify, added, out, part):
     """added [N, out] or [0, out]: nothing."""
     scale = 1.0 / (1 << shift)
     half = float(1 << (shift - 1)) if shift > 0 else 0.0
-    for block in portion((len(x) + TASK_ROWS - 1) // TASK_ROWS, share):
+    for block in chunk_of((len(x) + TASK_ROWS - 1) // TASK_ROWS, part):
         sums = np.empty(out.shape[1])
         inputs = np.zeros(len(weight))
         for n in range(block * TASK_ROWS, min((block + 1) * TASK_ROWS, len(x))):
@@ -255,12 +255,12 @@ def _layer(x, weight, bias, shift, rectify, added, out, share):
                 out[n, c] = np.int32(y)
 
 
-@njit(parallel=True, worth=rows_a_thread(512))
-def _parameters(x, weight, bias, shift, rectify, mask, rows, means, index, share):
+@njit(parallel=True, max_threads=rows_a_thread(512))
+def _parameters(x, weight, bias, shift, rectify, mask, rows, means, index, part):
     scale = 1.0 / (1 << shift)
     half = float(1 << (shift - 1)) if shift > 0 else 0.0
     slots, channels = mask.shape[1], means.shape[1]
-    for block in portion((len(x) + TASK_ROWS - 1) // TASK_ROWS, share):
+    for block in chunk_of((len(x) + TASK_ROWS - 1) // TASK_ROWS, part):
         sums = np.empty(weight.shape[1])
         inputs = np.zeros(len(weight))
         for n in range(block * TASK_ROWS, min((block + 1) * TASK_ROWS, len(x))):

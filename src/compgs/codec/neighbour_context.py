@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from compgs.codec.integer_network import ACTIVATION_LIMIT, FRACTION_BITS, IntegerNetwork, centre_of
-from compgs.numerics.compiled import njit, portion, rows_a_thread
+from compgs.numerics.compiled import chunk_of, njit, rows_a_thread
 from compgs.ordering.neighbours import AROUND, BESIDES, NEAREST_WEIGHT, Neighbours
 
 
@@ -28,16 +28,16 @@ def neighbour_context(
         deviations = np.empty((len(earlier), len(centre)))
         sizes = np.empty(len(earlier), np.int64)
         _deviate(earlier, centre.astype(np.float64), deviations, sizes)
-        _say(found.node, found.around, offsets, deviations, sizes, out)
+        _describe_neighbours(found.node, found.around, offsets, deviations, sizes, out)
     return out
 
 
-@njit(parallel=True, worth=rows_a_thread(512))
-def _deviate(earlier, centre, deviations, sizes, share):
+@njit(parallel=True, max_threads=rows_a_thread(512))
+def _deviate(earlier, centre, deviations, sizes, part):
     """How far latents are from the centre, in each channel and on average."""
     channels = len(centre)
     low, high = -float(ACTIVATION_LIMIT), float(ACTIVATION_LIMIT - 1)
-    for j in portion(len(earlier), share):
+    for j in chunk_of(len(earlier), part):
         size = 0.0
         for c in range(channels):
             deviations[j, c] = min(max(earlier[j, c] - centre[c], low), high)
@@ -45,11 +45,11 @@ def _deviate(earlier, centre, deviations, sizes, share):
         sizes[j] = np.int64(size) // channels
 
 
-@njit(parallel=True, worth=rows_a_thread(512))
-def _say(node, around, offsets, deviations, sizes, out, share):
+@njit(parallel=True, max_threads=rows_a_thread(512))
+def _describe_neighbours(node, around, offsets, deviations, sizes, out, part):
     known, channels = deviations.shape
     sums = np.empty(channels)
-    for i in portion(len(out), share):
+    for i in chunk_of(len(out), part):
         a = known + i
         sums[:] = 0.0
         weights, activity = np.int64(0), np.int64(0)

@@ -25,7 +25,7 @@ from compgs.codec.rows import (
 )
 from compgs.codec.tables import LOOKUP_BITS, PRECISION_BITS, FrequencyTables
 from compgs.errors import CorruptSection
-from compgs.numerics.compiled import njit, portion, rows_a_thread
+from compgs.numerics.compiled import chunk_of, njit, rows_a_thread
 
 CHUNK_SYMBOLS = 1 << 20
 SINGLE_STATE_SYMBOLS = (
@@ -230,9 +230,9 @@ def _encode_chunk(symbols, index, lowest, counts, offsets, cumulative, words):
     return position, escapes
 
 
-@njit(parallel=True, worth=rows_a_thread(1))
-def _encode_chunks(symbols, index, lowest, counts, offsets, cumulative, words, first, escapes, share):
-    for c in portion(len(first), share):
+@njit(parallel=True, max_threads=rows_a_thread(1))
+def _encode_chunks(symbols, index, lowest, counts, offsets, cumulative, words, first, escapes, part):
+    for c in chunk_of(len(first), part):
         start = c * CHUNK_SYMBOLS
         stop = min(start + CHUNK_SYMBOLS, len(symbols))
         first[c], escapes[c] = _encode_chunk(
@@ -279,7 +279,7 @@ def _first_states(words, begin, end, single):
     return position, even, odd
 
 
-@njit(apart=True)
+@njit(no_alias=True)
 def _decode_chunk(words, begin, end, index, lowest, counts, offsets, cumulative, lookup, symbols):
     """Number of escapes, -1 if the words are not what an encoder writes."""
     single = len(symbols) < SINGLE_STATE_SYMBOLS
@@ -303,9 +303,9 @@ def _decode_chunk(words, begin, end, index, lowest, counts, offsets, cumulative,
     return escapes
 
 
-@njit(parallel=True, worth=rows_a_thread(1))
-def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, lookup, symbols, escapes, share):
-    for c in portion(len(escapes), share):
+@njit(parallel=True, max_threads=rows_a_thread(1))
+def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, lookup, symbols, escapes, part):
+    for c in chunk_of(len(escapes), part):
         start = c * CHUNK_SYMBOLS
         stop = min(start + CHUNK_SYMBOLS, len(symbols))
         escapes[c] = _decode_chunk(
@@ -314,7 +314,7 @@ def _decode_chunks(words, ends, index, lowest, counts, offsets, cumulative, look
         )  # fmt: skip
 
 
-@njit(apart=True)
+@njit(no_alias=True)
 def _decode_rows_chunk(
     words, begin, end, index, lowest, counts, offsets, cumulative, lookup, first, width, inertia, known, edges, symbols
 ):  # fmt: skip
@@ -353,12 +353,12 @@ def _decode_rows_chunk(
     return escapes
 
 
-@njit(parallel=True, worth=rows_a_thread(1))
+@njit(parallel=True, max_threads=rows_a_thread(1))
 def _decode_rows(
     words, ends, index, lowest, counts, offsets, cumulative, lookup, width, inertia, known, edges,
-    symbols, escapes, share,
+    symbols, escapes, part,
 ):  # fmt: skip
-    for c in portion(len(escapes), share):
+    for c in chunk_of(len(escapes), part):
         start = c * CHUNK_SYMBOLS
         stop = min(start + CHUNK_SYMBOLS, len(symbols))
         escapes[c] = _decode_rows_chunk(

@@ -57,7 +57,7 @@ from compgs.codec.tmc3 import decode_positions_tmc3
 from compgs.codec.viewpoints import Viewpoints, decode_viewpoints
 from compgs.codec.weights import QuantizedTensor, decode_heads, decode_known_heads, decode_networks
 from compgs.errors import CorruptSection
-from compgs.numerics.crew import CREW
+from compgs.numerics.threads import THREADS
 from compgs.ordering.order import level_counts, represented
 
 
@@ -161,7 +161,7 @@ def read_latents(
     if prefix:  # only the positions prove that there are so many anchors
         coordinates, others = read_positions(), read_others()
     else:
-        coordinates, others = CREW.both(read_positions, read_others)
+        coordinates, others = THREADS.both(read_positions, read_others)
     mask, priors = others.mask, others.priors
     if int(mask.sum()) != scene.coupled:
         raise CorruptSection(

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from compgs.codec.tables import GAUSSIAN_COUNT, SCALES_PER_OCTAVE, FrequencyTables, gaussian_tables
-from compgs.numerics.compiled import njit, portion, rows_a_thread
+from compgs.numerics.compiled import chunk_of, njit, rows_a_thread
 
 CHAIN_BITS = (
     6  # elements of a chain are in units of 2^-6: finer ones move no step of the files that were tried
@@ -62,25 +62,25 @@ def chain_length(channels: int) -> int:
 
 def steps_of_rows(context: RowContext, symbols: np.ndarray) -> np.ndarray:  # [n, C] int32
     """Whole steps between latents and means, from symbols."""
-    return symbols if context.chain is None else _along(context.chain, symbols, 1)
+    return symbols if context.chain is None else _along_chain(context.chain, symbols, 1)
 
 
 def symbols_of_rows(context: RowContext, steps: np.ndarray) -> np.ndarray:  # [n, C] int32
     """Inverse of `steps_of_rows`."""
-    return steps if context.chain is None else _along(context.chain, steps, -1)
+    return steps if context.chain is None else _along_chain(context.chain, steps, -1)
 
 
-def _along(chain: np.ndarray, given: np.ndarray, sign: int) -> np.ndarray:
+def _along_chain(chain: np.ndarray, given: np.ndarray, sign: int) -> np.ndarray:
     out = np.empty(given.shape, np.int32)
     _follow_chain(chain.astype(np.int64), np.ascontiguousarray(given), sign, out)
     return out
 
 
-@njit(parallel=True, worth=rows_a_thread(512))
-def _follow_chain(chain, given, sign, out, share):
+@njit(parallel=True, max_threads=rows_a_thread(512))
+def _follow_chain(chain, given, sign, out, part):
     """Steps from symbols (sign 1), where those before are in `out` already, or symbols from steps (-1)."""
     lowest, highest = np.int64(-(1 << 31)), np.int64((1 << 31) - 1)
-    for n in portion(len(given), share):
+    for n in chunk_of(len(given), part):
         place = 0
         for c in range(given.shape[1]):
             expected = np.int64(1 << (CHAIN_BITS - 1))

@@ -16,7 +16,7 @@ from torch import Tensor
 from compgs.entropy.gaussian import BLOCK, FASTMATH, SCALE_LEVELS, element_bits, gaussian_bits
 from compgs.entropy.network import FRACTION_BITS, EntropyNetwork, round_fixed
 from compgs.entropy.quantization import quantize, round_straight_through
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.tensors import where
 from compgs.tensors.linear import transposed_product
 
@@ -145,13 +145,13 @@ def _quantize_row(y, out, noise, fixed, y_hat, x, s):
 
 
 @njit(parallel=True)
-def _code(y, out, noise, mask, fixed, y_hat, bits, by_x, by_s, share):
+def _code(y, out, noise, mask, fixed, y_hat, bits, by_x, by_s, part):
     """noise [0, C]: none; mask [0, 1]: all slots; bits [0]: not wanted."""
     n, c = y.shape
     rows = max(1, BLOCK // max(c, 1))
     flat_x, flat_s = by_x.reshape(-1), by_s.reshape(-1)
     none = np.empty(0, np.float32)
-    for block in portion((n + rows - 1) // rows, share):
+    for block in chunk_of((n + rows - 1) // rows, part):
         first, last = block * rows, min(n, (block + 1) * rows)
         scratch = np.empty((3, rows * c), np.float32)
         for i in range(first, last):
@@ -194,8 +194,8 @@ def _gradient_row(out, by_x, by_s, g, by_y_hat, d_y, d_out):
 
 
 @njit(parallel=True)
-def _code_gradient(out, by_x, by_s, g, by_y_hat, d_y, d_out, share):
+def _code_gradient(out, by_x, by_s, g, by_y_hat, d_y, d_out, part):
     none = np.empty(0, np.float32)
-    for i in portion(len(g), share):
+    for i in chunk_of(len(g), part):
         row = by_y_hat[i] if len(by_y_hat) > 0 else none
         _gradient_row(out[i], by_x[i], by_s[i], g[i], row, d_y[i], d_out[i])

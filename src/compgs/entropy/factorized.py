@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.tensors import where
 
 REACH = 24  # symbols -24 to 24 have a bin of their own
@@ -77,11 +77,11 @@ def _bin(z, reach):
 
 
 @njit(parallel=True)
-def _bits(z, p, bits, share):
+def _bits(z, p, bits, part):
     """z [N, C], p [C, bins] -> bits [N]."""
     N, C = z.shape
     reach = p.shape[1] // 2
-    for i in portion(N, share):
+    for i in chunk_of(N, part):
         total = np.float32(0)
         for c in range(C):
             k, f, beyond = _bin(z[i, c], reach)
@@ -91,12 +91,12 @@ def _bits(z, p, bits, share):
 
 
 @njit(parallel=True)
-def _bits_gradient(z, p, g, d_z, d_p, share):
+def _bits_gradient(z, p, g, d_z, d_p, part):
     """g [N], the gradient of the bits -> d_z [N, C] and parts d_p [chunks, C, bins] (zero before)."""
     N, C = z.shape
     reach = p.shape[1] // 2
     chunks = len(d_p)
-    for chunk in portion(chunks, share):
+    for chunk in chunk_of(chunks, part):
         for i in range(N * chunk // chunks, N * (chunk + 1) // chunks):
             for c in range(C):
                 k, f, beyond = _bin(z[i, c], reach)

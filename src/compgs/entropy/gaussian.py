@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.tensors import where
 
 SCALE_LEVELS = 128  # tables of the codec
@@ -203,11 +203,11 @@ def _element_gradient(s, g, by_x, by_s, d_x, d_s):
 
 
 @njit(parallel=True, fastmath=FASTMATH)
-def _bits(x, s, channels, bits, by_x, by_s, share):
+def _bits(x, s, channels, bits, by_x, by_s, part):
     """x, s flat [N * C] -> bits [N] and derivatives by_x, by_s, flat as x, or empty if not wanted."""
     N = len(bits)
     rows = max(1, BLOCK // max(channels, 1))
-    for block in portion((N + rows - 1) // rows, share):
+    for block in chunk_of((N + rows - 1) // rows, part):
         scratch = np.empty((3, rows * channels), np.float32)
         first, last = block * rows, min(N, (block + 1) * rows)
         p, q = first * channels, last * channels
@@ -223,11 +223,11 @@ def _bits(x, s, channels, bits, by_x, by_s, share):
 
 
 @njit(parallel=True, fastmath=FASTMATH)
-def _bits_gradient(s, channels, g, by_x, by_s, d_x, d_s, share):
+def _bits_gradient(s, channels, g, by_x, by_s, d_x, d_s, part):
     """g [N], the gradient of the bits -> gradients d_x, d_s, flat [N * C] as s."""
     N = len(g)
     rows = max(1, BLOCK // max(channels, 1))
-    for block in portion((N + rows - 1) // rows, share):
+    for block in chunk_of((N + rows - 1) // rows, part):
         scratch = np.empty(rows * channels, np.float32)
         first, last = block * rows, min(N, (block + 1) * rows)
         for r in range(last - first):

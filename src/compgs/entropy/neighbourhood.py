@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.ordering.neighbours import BESIDES, find_neighbours
 from compgs.ordering.order import canonical_order, level_counts, octree_depth, octree_origin
 from compgs.ordering.ranges import chosen_levels
@@ -32,7 +32,7 @@ class Neighbourhood:
         rows = torch.arange(len(latents), device=latents.device) if rows is None else rows
         if where.in_kernels(latents):
             out = torch.zeros(len(rows), BESIDES + latents.shape[1])
-            _say(
+            _describe_neighbours(
                 rows.numpy(),
                 self.anchors.numpy(),
                 self.weights.numpy(),
@@ -91,10 +91,10 @@ def neighbourhood(coordinates: Tensor) -> Neighbourhood:
 
 
 @njit(parallel=True)
-def _say(rows, anchors, weights, latents, centre, out, share):
+def _describe_neighbours(rows, anchors, weights, latents, centre, out, part):
     channels = len(centre)
     mean = np.float32(1) / np.float32(channels)
-    for i in portion(len(rows), share):
+    for i in chunk_of(len(rows), part):
         row = rows[i]
         activity = np.float32(0)
         for e in range(anchors.shape[1]):

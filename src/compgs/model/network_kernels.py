@@ -14,7 +14,7 @@ BLAS (`tensors/residual_mlp_kernels.py`); these need nothing but numba.
 import numpy as np
 
 from compgs.model.constants import NEGATIVE_SLOPE
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.numerics.products import multiply
 
 ANCHORS = 128  # in a block
@@ -97,10 +97,10 @@ def begin(
     anchor_entry,  # [F, H + O]
     entry_bias,  # [H + O]
     shared,  # [A, H + O], written
-    share,
+    part,
 ):
     """The anchors' part of the first layer and of the skip, biases included."""
-    for block in portion((len(features) + ANCHORS - 1) // ANCHORS, share):
+    for block in chunk_of((len(features) + ANCHORS - 1) // ANCHORS, part):
         first, last = block * ANCHORS, min(len(features), (block + 1) * ANCHORS)
         begin_block(features[first:last], anchor_entry, entry_bias, shared[first:last])
 
@@ -127,14 +127,14 @@ def forward(
     biases2,
     output_weight,
     out,  # [M, O], written
-    share,
+    part,
 ):
     M, G, blocks = len(index), len(residual_entry), len(weights1)
     H, O = output_weight.shape
     groups = (M + ROWS - 1) // ROWS
     tasks = min(groups, TASKS)
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
-    for t in portion(tasks, share):
+    for t in chunk_of(tasks, part):
         own = np.empty((ROWS, G), np.float32)
         first = np.empty((ROWS, H + O), np.float32)
         x = np.empty((blocks + 1, ROWS, H), np.float32)

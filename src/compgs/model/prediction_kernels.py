@@ -16,7 +16,7 @@ import numpy as np
 
 from compgs.model.constants import OPACITY_CUTOFF, SMALLEST_DISTANCE
 from compgs.model.network_kernels import ANCHORS, ROWS, TASKS, begin_block, hidden_layers, tiled
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.numerics.products import multiply
 
 _FASTMATH = {"contract", "nsz", "arcp"}
@@ -68,9 +68,9 @@ def _sigmoids(flat, n):
 def activate_opacities(
     raw,  # [P, C] of the opacity or the appearance network: opacity comes first
     opacities,  # [P]
-    share,
+    part,
 ):
-    for block in portion((len(raw) + ROWS - 1) // ROWS, share):
+    for block in chunk_of((len(raw) + ROWS - 1) // ROWS, part):
         first, last = block * ROWS, min(len(raw), (block + 1) * ROWS)
         for i in range(first, last):
             opacities[i] = _TWO * raw[i, 0]
@@ -84,10 +84,10 @@ def activate_colors(
     raw,  # [P, C] of the color or the appearance network: color comes last
     rows,  # [M] int64: those to activate
     colors,  # [M, 3] display RGB
-    share,
+    part,
 ):
     m, first_channel = len(rows), raw.shape[1] - 3
-    for block in portion((m + ROWS - 1) // ROWS, share):
+    for block in chunk_of((m + ROWS - 1) // ROWS, part):
         first, last = block * ROWS, min(m, (block + 1) * ROWS)
         for j in range(first, last):
             for c in range(3):
@@ -104,10 +104,10 @@ def affine_transform(
     means,  # [M, 3] world units
     scales,  # [M, 3] world units
     quaternions,  # [M, 4] w-x-y-z, not normalized
-    share,
+    part,
 ):
     m = len(raw)
-    for block in portion((m + ROWS - 1) // ROWS, share):
+    for block in chunk_of((m + ROWS - 1) // ROWS, part):
         first, last = block * ROWS, min(m, (block + 1) * ROWS)
         bounded = np.zeros((ROWS, 3), np.float32)
         for j in range(first, last):
@@ -141,9 +141,9 @@ def activation_gradients(
     d_appearance,  # [M, 4] by raw opacity and color
     d_geometry,  # [M, 10]
     d_log_scales,  # [A, 6] added to
-    share,
+    part,
 ):
-    for chunk in portion(len(bounds) - 1, share):
+    for chunk in chunk_of(len(bounds) - 1, part):
         for j in range(bounds[chunk], bounds[chunk + 1]):
             a = anchor[j]
             d_appearance[j, 0] = d_opacities[j] * (_ONE - opacities[j] * opacities[j])
@@ -170,9 +170,9 @@ def see(
     center,  # [3] of the camera, world units
     distance_unit,  # world units
     seen,  # [V, D + 4]: reference embedding, view embedding
-    share,
+    part,
 ):
-    for block in portion((len(anchors) + ANCHORS - 1) // ANCHORS, share):
+    for block in chunk_of((len(anchors) + ANCHORS - 1) // ANCHORS, part):
         first, last = block * ANCHORS, min(len(anchors), (block + 1) * ANCHORS)
         _see_block(anchors[first:last], positions, references, center, distance_unit, seen[first:last])
 
@@ -200,9 +200,9 @@ def gather_geometry(
     drawn_means,  # [M, 3], and so on, written
     drawn_scales,
     drawn_quaternions,
-    share,
+    part,
 ):
-    for block in portion((len(index) + ROWS - 1) // ROWS, share):
+    for block in chunk_of((len(index) + ROWS - 1) // ROWS, part):
         for j in range(block * ROWS, min(len(index), (block + 1) * ROWS)):
             p = index[j]
             for c in range(3):
@@ -236,13 +236,13 @@ def paired_appearance(
     output_weight,
     appearance,  # [places[V], 4], written: opacity (0: not drawn) and color
     drawn,  # [blocks] int64, written: primitives of each block that are drawn
-    share,
+    part,
 ):
     V, D, G, H = len(anchors), references.shape[1], residuals.shape[1], len(output_weight)
     blocks, layers = len(drawn), len(weights1)
     tasks = min(blocks, TASKS)
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
-    for t in portion(tasks, share):
+    for t in chunk_of(tasks, part):
         seen = np.empty((ANCHORS, D + 4), np.float32)
         shared = np.empty((ANCHORS, H + 4), np.float32)
         own = np.empty((ROWS, G), np.float32)
@@ -308,12 +308,12 @@ def gather_drawn(
     anchors, first_coupled, places, appearance, offsets,
     means, scales, quaternions,
     index, drawn_means, drawn_scales, drawn_quaternions, opacities, colors,
-    share,
+    part,
 ):  # fmt: skip
     """Fills the arrays of the drawn primitives and which they are; `offsets` [blocks + 1] int64: where each block's
     begin.
     """
-    for block in portion(len(offsets) - 1, share):
+    for block in chunk_of(len(offsets) - 1, part):
         to = offsets[block]
         for v in range(block * ANCHORS, min(len(anchors), (block + 1) * ANCHORS)):
             shift = first_coupled[anchors[v]] - places[v]

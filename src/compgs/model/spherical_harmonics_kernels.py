@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 
 _PI = math.pi
 # Norms of the basis functions: Y<degree>, and the monomials that they belong to.
@@ -45,7 +45,7 @@ def _basis(x, y, z, degree, b):
 
 
 @njit(inline="always")
-def _along(x, y, z, degree, g):
+def _position_gradient(x, y, z, degree, g):
     """Gradient by (x, y, z) of sum_k g_k Y_k, the Y taken as polynomials."""
     gx, gy, gz = _ZERO, _ZERO, _ZERO
     if degree >= 1:
@@ -78,10 +78,10 @@ def view_colors(
     visible,  # [M] bool: the others become black
     degree,  # up to which coefficients are used
     colors,  # [M, 3] display RGB, written
-    share,
+    part,
 ):
     n, used = len(means), (degree + 1) * (degree + 1) - 1
-    for block in portion((n + _BLOCK - 1) // _BLOCK, share):
+    for block in chunk_of((n + _BLOCK - 1) // _BLOCK, part):
         b = np.empty(15, np.float32)
         for i in range(block * _BLOCK, min(block * _BLOCK + _BLOCK, n)):
             if not visible[i]:
@@ -109,10 +109,10 @@ def view_colors_gradient(
     d_means,  # [M, 3], and so on, written
     d_dc,
     d_rest,
-    share,
+    part,
 ):
     n, held, used = len(means), rest.shape[1], (degree + 1) * (degree + 1) - 1
-    for block in portion((n + _BLOCK - 1) // _BLOCK, share):
+    for block in chunk_of((n + _BLOCK - 1) // _BLOCK, part):
         b, g = np.empty(15, np.float32), np.empty(15, np.float32)
         for i in range(block * _BLOCK, min(block * _BLOCK + _BLOCK, n)):
             # Nothing reaches a channel that was clamped; splats out of view are black in all three.
@@ -134,7 +134,7 @@ def view_colors_gradient(
                 g[k] = red * rest[i, k, 0] + green * rest[i, k, 1] + blue * rest[i, k, 2]
             for k in range(used, held):
                 d_rest[i, k, 0] = d_rest[i, k, 1] = d_rest[i, k, 2] = _ZERO
-            gx, gy, gz = _along(x, y, z, degree, g)
+            gx, gy, gz = _position_gradient(x, y, z, degree, g)
             # The length of mean - centre does not matter: only what is across the direction moves it.
             radial = gx * x + gy * y + gz * z
             d_means[i, 0] = (gx - radial * x) * inverse

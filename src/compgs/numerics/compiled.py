@@ -1,21 +1,21 @@
 """`njit`, as every kernel of the package uses it: compiled once on a machine, never stale, in any number of threads.
 
 The options are numba's. There is no `cache`: kernels are always kept (`kernel_cache`). With `parallel=True` a kernel
-is called by several threads at once (`crew`), each with its share of the work as the last argument, which callers from
-Python leave out:
+is called by several threads at once (`threads`), each with its part of the work as the last argument, which callers
+from Python leave out:
 
     @njit(parallel=True)
-    def double(x, y, share):
-        for i in portion(len(x), share):
+    def double(x, y, part):
+        for i in chunk_of(len(x), part):
             y[i] = 2 * x[i]
 
     double(x, y)
 
-To hand over a share takes 20 microseconds: with `worth`, a function of the same arguments, a kernel says among how many
-threads a call is worth to be shared at most.
+To hand over a part takes 20 microseconds: with `max_threads`, a function of the same arguments, a kernel says among how
+many threads a call is worth to be divided at most.
 
-Shares are contiguous. What stands before the loop is done by every thread. Arrays of one call must not overlap; of
-other kernels `apart=True` promises that.
+Parts are contiguous. What stands before the loop is done by every thread. Arrays of one call must not overlap; of other
+kernels `no_alias=True` promises that.
 
 Any number of Python threads may call kernels at the same time. Processes are to be started with `spawn`: kernels run
 in forked ones, too, but torch's threads do not survive a fork.
@@ -30,8 +30,8 @@ from numba.core import compiler, event, types
 from numba.core.registry import CPUDispatcher
 
 from compgs.numerics.compiling import COMPILING
-from compgs.numerics.crew import ALL, CREW, Share
 from compgs.numerics.kernel_cache import cache_of
+from compgs.numerics.threads import THREADS, WHOLE, Part
 
 
 class Kernel(CPUDispatcher):
@@ -45,20 +45,20 @@ class Kernel(CPUDispatcher):
 
 
 class ParallelKernel(Kernel):
-    """A compiled function whose calls are shared among threads."""
+    """A compiled function whose calls are divided among threads."""
 
-    # Of a call's arguments: among how many threads at most it is worth to share it; None: among all
-    worth: Callable[..., int] | None = None
+    # Of a call's arguments: among how many threads at most it is worth to divide it; None: among all
+    max_threads: Callable[..., int] | None = None
 
     def __call__(self, *args: Any) -> None:
         call = super().__call__
         count = numba.get_num_threads()
-        if self.worth is not None:
-            count = min(count, self.worth(*args))
+        if self.max_threads is not None:
+            count = min(count, self.max_threads(*args))
         if count <= 1:
-            call(*args, ALL)
+            call(*args, WHOLE)
         else:
-            CREW.do(lambda share: call(*args, share), count)
+            THREADS.do(lambda part: call(*args, part), count)
 
 
 class _WithoutOverlaps(compiler.Compiler):
@@ -76,15 +76,15 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         return lambda given: njit(given, **options)
     if not isinstance(function, FunctionType) or "cache" in options:
         raise TypeError("expected a function, and numba's options but for cache")
-    parallel, worth = options.pop("parallel", False), options.pop("worth", None)
-    compiled_by = _WithoutOverlaps if options.pop("apart", parallel) else compiler.Compiler
+    parallel, max_threads = options.pop("parallel", False), options.pop("max_threads", None)
+    compiled_by = _WithoutOverlaps if options.pop("no_alias", parallel) else compiler.Compiler
     if getattr(numba.config, "DISABLE_JIT", False):
-        return (lambda *args: function(*args, ALL)) if parallel else function
+        return (lambda *args: function(*args, WHOLE)) if parallel else function
     kernel: Any
     if parallel:
         options = {"nogil": True, "error_model": "numpy", **options}
         kernel = ParallelKernel(function, targetoptions=_options(options), pipeline_class=compiled_by)
-        kernel.worth = worth
+        kernel.max_threads = max_threads
     else:
         kernel = Kernel(function, targetoptions=_options(options), pipeline_class=compiled_by)
     kernel._cache = cache_of(function)
@@ -92,7 +92,7 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 
 def rows_a_thread(least: int) -> Callable[..., int]:
-    """Return a `worth` with which each thread has `least` rows of the last argument or more."""
+    """Return `max_threads` with which each thread has `least` rows of the last argument or more."""
     return lambda *arguments: len(arguments[-1]) // least
 
 
@@ -102,10 +102,10 @@ def _options(options: dict[str, Any]) -> dict[str, Any]:
 
 
 @njit
-def portion(count: int, share: Share) -> range:
-    """The part of range(count) that is in a share; for kernels."""
-    part, parts = share
-    return range(count * part // parts, count * (part + 1) // parts)
+def chunk_of(count: int, part: Part) -> range:
+    """What a part of the work has of range(count); for kernels."""
+    number, parts = part
+    return range(count * number // parts, count * (number + 1) // parts)
 
 
 class _Clock(event.Listener):

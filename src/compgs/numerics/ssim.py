@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.numerics.vector_sums import add_in_any_order
 
 WINDOW_SIZE = 11
@@ -74,7 +74,7 @@ def _find_rows(r, H, rows, weights):
         weights[k] = _TAPS[k] if inside else _ZERO
 
 
-@njit(fastmath=_FASTMATH, apart=True)
+@njit(fastmath=_FASTMATH, no_alias=True)
 def _products(S, at, x, y, scale, rows, weights, left, right):
     """Weighted sums over rows [11] of x, y, x x, y y and x y, for columns from `left` to `right`: to scratch rows 0 to
     4, from element `at`.
@@ -115,7 +115,7 @@ def _similarity(S, n, counts=None):
     return total
 
 
-@njit(fastmath=_FASTMATH, apart=True)
+@njit(fastmath=_FASTMATH, no_alias=True)
 def _summed_maps(S, at, maps, rows, weights, left, right):
     """Weighted sums over rows [11] of the three maps [H, 3, C]: to scratch rows 0 to 2, as `_products`."""
     at, left = _u(at), _u(left)
@@ -152,7 +152,7 @@ def _absolute_difference(x, y, scale):
 
 
 @njit(parallel=True)
-def _compare(x, y, scale, maps, sums, counts, share):
+def _compare(x, y, scale, maps, sums, counts, part):
     """x, y [H, 3 W] -> sums [H, 2] of |x - y| and SSIM by row, maps [H, 3, 3 W] of the gradient of SSIM.
 
     counts [H, 3 W] float32: factors on SSIM at each element; None: one.
@@ -160,7 +160,7 @@ def _compare(x, y, scale, maps, sums, counts, share):
     H, W = x.shape
     S = np.empty(_SCRATCH, np.float32)
     rows, weights = np.empty(WINDOW_SIZE, np.uint64), np.empty(WINDOW_SIZE, np.float32)
-    for r in portion(H, share):
+    for r in chunk_of(H, part):
         _find_rows(r, H, rows, weights)
         similarity = 0.0
         for first in range(0, W, _TILE):
@@ -179,12 +179,12 @@ def _compare(x, y, scale, maps, sums, counts, share):
 
 
 @njit(parallel=True)
-def _compare_gradient(x, y, scale, maps, ssim_factor, l1_factor, d_x, share):
+def _compare_gradient(x, y, scale, maps, ssim_factor, l1_factor, d_x, part):
     """d_x [H, 3 W] = ssim_factor * dSSIM/dx + l1_factor * sign(x - y)."""
     H, W = x.shape
     S = np.empty(_SCRATCH, np.float32)
     rows, weights = np.empty(WINDOW_SIZE, np.uint64), np.empty(WINDOW_SIZE, np.float32)
-    for r in portion(H, share):
+    for r in chunk_of(H, part):
         _find_rows(r, H, rows, weights)
         for first in range(0, W, _TILE):
             last = min(W, first + _TILE)

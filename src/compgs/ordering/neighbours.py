@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compgs.numerics.compiled import njit, portion, rows_a_thread
+from compgs.numerics.compiled import chunk_of, njit, rows_a_thread
 
 # What a network takes of an anchor's neighbours, before what its means follow: known, activity.
 BESIDES = 2
@@ -94,9 +94,9 @@ def _enter(offsets, shift, table, factors):
         table[at] = j
 
 
-@njit(parallel=True, worth=rows_a_thread(512))
-def _look_around(offsets, holds_some, shift, table, factors, around, share):
-    for j in portion(len(holds_some), share):
+@njit(parallel=True, max_threads=rows_a_thread(512))
+def _look_around(offsets, holds_some, shift, table, factors, around, part):
+    for j in chunk_of(len(holds_some), part):
         if not holds_some[j]:
             continue
         x, y, z = offsets[j, 0] >> shift, offsets[j, 1] >> shift, offsets[j, 2] >> shift
@@ -108,9 +108,9 @@ def _look_around(offsets, holds_some, shift, table, factors, around, share):
                     place += 1
 
 
-@njit(parallel=True, worth=rows_a_thread(512))
-def _look_up(offsets, known, shift, table, factors, node, share):
-    for i in portion(len(node), share):
+@njit(parallel=True, max_threads=rows_a_thread(512))
+def _look_up(offsets, known, shift, table, factors, node, part):
+    for i in chunk_of(len(node), part):
         a = known + i
         x, y, z = offsets[a, 0] >> shift, offsets[a, 1] >> shift, offsets[a, 2] >> shift
         node[i] = _find(offsets, shift, table, factors, x, y, z)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.render.settings import RasterSettings
 
 TILE_WIDTH = 8  # pixels
@@ -189,10 +189,10 @@ def find_visible(
     packed,
     found,
     room,
-    share,
+    part,
 ):
     """Fills `visible` [M] and, of the visible, `boxes` [M, 4] and log2 opacity; counts for each chunk."""
-    for chunk in portion(CHUNKS, share):
+    for chunk in chunk_of(CHUNKS, part):
         begin, end = chunk_bounds(chunk, means.shape[0])
         n, tiles = np.int64(0), np.int64(0)
         for i in range(begin, end):
@@ -221,10 +221,10 @@ def find_visible(
 def find_tiles(
     means, covariances, determinants, colors, log2_cutoff, tiles_x, visible, boxes, room,
     packed, slots, rows, first_slot, slots_used, counts,
-    share,
+    part,
 ):  # fmt: skip
     """Packs the visible splats, lists the tiles (`slots`) and rows that each one touches, and counts by tile."""
-    for chunk in portion(CHUNKS, share):
+    for chunk in chunk_of(CHUNKS, part):
         counts[chunk, :] = 0
         begin, end = chunk_bounds(chunk, means.shape[0])
         slot = np.int64(0)
@@ -295,10 +295,10 @@ def start_tiles(counts, starts):
 
 
 @njit(parallel=True)
-def fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, entries, keys, share):
+def fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, entries, keys, part):
     """Writes the tiles' entries and depth keys; the slots then say where a splat's entries are."""
     bits = depths.view(np.uint32)  # depths are positive: their bits sort as they do
-    for chunk in portion(CHUNKS, share):
+    for chunk in chunk_of(CHUNKS, part):
         begin, end = chunk_bounds(chunk, visible.shape[0])
         for i in range(begin, end):
             if not visible[i]:
@@ -314,10 +314,10 @@ def fill_tiles(visible, depths, first_slot, slots_used, slots, rows, counts, ent
 
 
 @njit(parallel=True)
-def sort_tiles(starts, keys, order, share):
+def sort_tiles(starts, keys, order, part):
     """`order` [E]: each tile's entries by `keys` [E], equal ones as they come. It may take the place of the keys."""
     tiles = starts.shape[0] - 1
-    for turn in portion(turns(tiles), share):
+    for turn in chunk_of(turns(tiles), part):
         tile = tile_at(turn, tiles)
         if tile < tiles:
             begin, end = starts[tile], starts[tile + 1]

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from compgs.cameras import Camera
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.render.settings import RasterSettings, jacobian_limits
 
 # No "nnan", "ninf": comparisons with NaN decide what is drawn.
@@ -90,10 +90,10 @@ def load_block(s, first, count, means, quaternions, scales):
 
 
 @njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
-def project_forward(means, quaternions, scales, k, means2d, covariances, depths, determinants, share):
+def project_forward(means, quaternions, scales, k, means2d, covariances, depths, determinants, part):
     """Fills means2d [M, 2], covariances [M, 3], depths [M], determinants [M]; a depth of inf: not drawn."""
     m = means.shape[0]
-    for block in portion((m + BLOCK - 1) // BLOCK, share):
+    for block in chunk_of((m + BLOCK - 1) // BLOCK, part):
         first = block * BLOCK
         count = min(BLOCK, m - first)
         r00, r01, r02 = k[0], k[1], k[2]
@@ -166,11 +166,11 @@ def project_backward(
     grad_means,
     grad_quaternions,
     grad_scales,
-    share,
+    part,
 ):
     """Gradients to means [M, 3], quaternions [M, 4] and scales [M, 3]; zero where a Gaussian is not drawn."""
     m = means.shape[0]
-    for block in portion((m + BLOCK - 1) // BLOCK, share):
+    for block in chunk_of((m + BLOCK - 1) // BLOCK, part):
         first = block * BLOCK
         count = min(BLOCK, m - first)
         r00, r01, r02 = k[0], k[1], k[2]

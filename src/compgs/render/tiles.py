@@ -19,7 +19,7 @@ variables (rather than in the buffer) spare the compiled code a check for overla
 
 import numpy as np
 
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.numerics.vector_sums import add_in_any_order
 from compgs.render.binning import (
     CHUNKS,
@@ -92,12 +92,12 @@ def pass_through(t, uncapped, cutoff, cap, stop):
 
 @njit(parallel=True, fastmath=FASTMATH, error_model="numpy")
 def blend_forward(
-    packed, starts, entries, order, background, cutoff, cap, stop, image, transmittance, ends, share
+    packed, starts, entries, order, background, cutoff, cap, stop, image, transmittance, ends, part
 ):
     """Fills image [H, W, 3], transmittance [H, W] and, per tile, the entry after the last one needed."""
     height, width = transmittance.shape
     tiles = starts.shape[0] - 1
-    for turn in portion(turns(tiles), share):
+    for turn in chunk_of(turns(tiles), part):
         tile = tile_at(turn, tiles)
         if tile >= tiles:
             continue
@@ -169,7 +169,7 @@ def start_tile(s, left, top, width, height):
 def blend_backward(
     packed, starts, entries, order, ends, cutoff, cap, stop,
     image, transmittance, grad_image, grad_transmittance, moments,
-    share,
+    part,
 ):  # fmt: skip
     """Fills moments [E, MOMENTS]: for each entry the sums over its pixels that gradients are made of.
 
@@ -177,7 +177,7 @@ def blend_backward(
     """
     height, width = transmittance.shape
     tiles = starts.shape[0] - 1
-    for turn in portion(turns(tiles), share):
+    for turn in chunk_of(turns(tiles), part):
         tile = tile_at(turn, tiles)
         if tile >= tiles:
             continue
@@ -250,14 +250,14 @@ def blend_backward(
 def sum_moments(
     visible, packed, first_slot, slots_used, slots, moments, opacities,
     grad_means, grad_covariances, grad_opacities, grad_colors,
-    share,
+    part,
 ):  # fmt: skip
     """Adds up each splat's tiles, and turns moments into gradients.
 
     With X = cov^-1 and alpha = opacity exp(-d^T X d / 2): dL/dmean = -X sum(v d), dL/dcov = X sum(v d d^T) X
     / 2.
     """
-    for chunk in portion(CHUNKS, share):
+    for chunk in chunk_of(CHUNKS, part):
         begin, end = chunk_bounds(chunk, visible.shape[0])
         for i in range(begin, end):
             if not visible[i]:

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from compgs.cameras import Camera
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.render.settings import RasterSettings, jacobian_limits
 
 BLOCK = 4096  # anchors
@@ -33,7 +33,7 @@ def visible_mask(
     mask = np.empty(len(positions), np.bool_)
     # Writable: kernels would be compiled anew for arrays that are read-only.
     positions, radii = (np.require(a, np.float32, ("C", "W")) for a in (positions, radii))
-    meet_frustum(positions, radii, frustum(camera, settings).astype(np.float32), mask)
+    mark_visible(positions, radii, frustum(camera, settings).astype(np.float32), mask)
     return mask
 
 
@@ -61,9 +61,9 @@ def frustum(camera: Camera, settings: RasterSettings) -> np.ndarray:
 
 
 @njit(parallel=True, fastmath={"contract", "nsz"}, error_model="numpy")
-def meet_frustum(positions, radii, planes, mask, share):
+def mark_visible(positions, radii, planes, mask, part):
     n = positions.shape[0]
-    for block in portion((n + BLOCK - 1) // BLOCK, share):
+    for block in chunk_of((n + BLOCK - 1) // BLOCK, part):
         for i in range(block * BLOCK, min(block * BLOCK + BLOCK, n)):
             x, y, z, radius = positions[i, 0], positions[i, 1], positions[i, 2], radii[i]
             kept = True

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.numerics.products import add_product
 from compgs.tensors import where
 
@@ -65,8 +65,8 @@ def transposed_product(x: Tensor, y: Tensor) -> Tensor:
 
 
 @njit(parallel=True)
-def _sum_products(x, y, parts, share):
+def _sum_products(x, y, parts, part):
     n = len(x)
-    for c in portion(len(parts), share):
+    for c in chunk_of(len(parts), part):
         first, last = n * c // len(parts), n * (c + 1) // len(parts)
         add_product(x[first:last].T, y[first:last], parts[c])

@@ -22,7 +22,7 @@ from compgs.model.network_kernels import (
     chosen_rows,
     tiled,
 )
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 from compgs.numerics.products import add_product, multiply
 
 CHUNKS = 16  # partial sums of a weight gradient
@@ -111,7 +111,7 @@ def backward(
     # [chunks, size] zero, written: residual entry, per block weight 1, bias 1, weight 2, bias 2, then output weight;
     # [chunks, 0] if not wanted
     d_weights,
-    share,
+    part,
 ):
     G, blocks = len(residual_entry), len(weights1)
     H, O = output_weight.shape
@@ -125,14 +125,14 @@ def backward(
             for j in range(H):
                 weights1_t[b, j, i], weights2_t[b, j, i] = weights1[b, i, j], weights2[b, i, j]
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
-    for c in portion(len(bounds) - 1, share):
+    for c in chunk_of(len(bounds) - 1, part):
         own = np.empty((ROWS, G), np.float32)
         first = np.empty((ROWS, F), np.float32)
         x = np.empty((blocks + 1, ROWS, H), np.float32)
         h = np.empty((blocks, ROWS, H), np.float32)
         dx = np.empty((ROWS, H), np.float32)
         dh = np.empty((ROWS, H), np.float32)
-        part = np.empty((ROWS, G), np.float32)
+        d_taken = np.empty((ROWS, G), np.float32)
         ones = np.ones((1, ROWS), np.float32)
         weights = d_weights[c]
         for p in range(bounds[c], bounds[c + 1], ROWS):
@@ -166,7 +166,7 @@ def backward(
             if want_residuals and len(rows) == 0:
                 add_product(first[:n], entry_t, d_residuals[p:q])
             elif want_residuals:
-                multiply(first[:n], entry_t, part[:n])
+                multiply(first[:n], entry_t, d_taken[:n])
                 for i in range(n):
                     for j in range(G):
-                        d_residuals[rows[p + i], j] += part[i, j]
+                        d_residuals[rows[p + i], j] += d_taken[i, j]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compgs.numerics.compiled import njit, portion
+from compgs.numerics.compiled import chunk_of, njit
 
 PRIMES = (1, 2_654_435_761, 805_459_861)  # of the published hash
 
@@ -88,8 +88,8 @@ def _cell(place, cells):
 
 
 @njit(parallel=True)
-def _features(places, grid, cells, entries, offsets, found, share):
-    for v in portion(len(places), share):
+def _features(places, grid, cells, entries, offsets, found, part):
+    for v in chunk_of(len(places), part):
         for level in range(len(cells)):
             n, first, width = cells[level], offsets[level], grid.shape[1]
             x, fx = _cell(places[v, 0], n)
@@ -106,9 +106,9 @@ def _features(places, grid, cells, entries, offsets, found, share):
 
 
 @njit(parallel=True)
-def _gradient(places, d_features, cells, entries, offsets, d_grid, share):
+def _gradient(places, d_features, cells, entries, offsets, d_grid, part):
     """Levels are shared among threads, and have no entry in common: all sums have one order."""
-    for level in portion(len(cells), share):
+    for level in chunk_of(len(cells), part):
         n, first, width = cells[level], offsets[level], d_grid.shape[1]
         for v in range(len(places)):
             x, fx = _cell(places[v, 0], n)

@@ -1,8 +1,8 @@
-"""Threads that share the work of a kernel.
+"""Threads that divide the work of a kernel.
 
-A parallel kernel of the package is an ordinary compiled function, whose last argument says which share of its loop it
-is to do. (numba can divide loops itself: compiling takes three times as long then, and its threads serve one caller
-at a time.) The caller does the first share, the crew's threads the others; as many as `numba.set_num_threads` says.
+A parallel kernel of the package is an ordinary compiled function, whose last argument says which part of its loop it is
+to do. (numba can divide loops itself: compiling takes three times as long then, and its threads serve one caller at a
+time.) The caller does the first part, other threads the rest; as many in all as `numba.set_num_threads` says.
 """
 
 import os
@@ -15,11 +15,11 @@ import numba
 
 A = TypeVar("A")
 B = TypeVar("B")
-Share = tuple[int, int]  # (which, of how many)
-ALL: Share = (0, 1)
+Part = tuple[int, int]  # (which, of how many)
+WHOLE: Part = (0, 1)
 
 
-class Crew:
+class Threads:
     """Threads that wait for work. They are started when they are first needed, and end with the process."""
 
     def __init__(self) -> None:
@@ -28,14 +28,14 @@ class Crew:
     def start_anew(self) -> None:
         """Forget the threads: after a fork there are none."""
         self._work: SimpleQueue[_Task] = SimpleQueue()
-        self._members = 0
-        self._hiring = threading.Lock()
+        self._started = 0
+        self._starting = threading.Lock()
 
-    def do(self, work: Callable[[Share], None], count: int) -> None:
+    def do(self, work: Callable[[Part], None], count: int) -> None:
         """`work((i, count))` for each i below count, at the same time. Raises what the first of those raised that did,
         once all ended.
         """
-        self._grow(count - 1)
+        self._start(count - 1)
         done: SimpleQueue[tuple[int, BaseException | None]] = SimpleQueue()
         for i in range(1, count):
             self._work.put((work, (i, count), done))
@@ -62,8 +62,8 @@ class Crew:
         of_first: list[A] = []
         of_second: list[B] = []
 
-        def work(share: Share) -> None:
-            if share[0] == 0:
+        def work(part: Part) -> None:
+            if part[0] == 0:
                 of_first.append(first())
             else:
                 of_second.append(second())
@@ -71,35 +71,34 @@ class Crew:
         self.do(work, 2)
         return of_first[0], of_second[0]
 
-    def _grow(self, members: int) -> None:
-        if self._members < members:
-            with self._hiring:
-                while self._members < members:
-                    name = f"compgs-{self._members + 1}"
+    def _start(self, count: int) -> None:
+        if self._started < count:
+            with self._starting:
+                while self._started < count:
+                    name = f"compgs-{self._started + 1}"
                     threading.Thread(target=self._serve, name=name, daemon=True).start()
-                    self._members += 1
+                    self._started += 1
 
     def _serve(self) -> None:
-        numba.set_num_threads(
-            1
-        )  # of this thread: it shares nothing further, or all might wait for each other
+        # Of this thread: it divides nothing further, or all might wait for each other.
+        numba.set_num_threads(1)
         while True:
-            work, share, done = self._work.get()
-            done.put((share[0], _attempt(work, share)))
+            work, part, done = self._work.get()
+            done.put((part[0], _attempt(work, part)))
             del work, done  # the caller's arrays are not held until the next task
 
 
-_Task = tuple[Callable[[Share], None], Share, SimpleQueue]
+_Task = tuple[Callable[[Part], None], Part, SimpleQueue]
 
 
-def _attempt(work: Callable[[Share], None], share: Share) -> BaseException | None:
+def _attempt(work: Callable[[Part], None], part: Part) -> BaseException | None:
     try:
-        work(share)
+        work(part)
     except BaseException as error:
         return error
     return None
 
 
-CREW = Crew()
+THREADS = Threads()
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=CREW.start_anew)
+    os.register_at_fork(after_in_child=THREADS.start_anew)
