@@ -8,7 +8,13 @@ from compgs.cameras import Camera
 from compgs.errors import ConfigError
 from compgs.numerics.rotations import rigid
 from compgs.scene import Points
-from compgs.scene.points import COORDINATE_BITS, fallback_points, median_spacing, voxel_grid
+from compgs.scene.points import (
+    COORDINATE_BITS,
+    fallback_points,
+    median_spacing,
+    neighbour_distance,
+    voxel_grid,
+)
 
 
 def points_at(positions: np.ndarray) -> Points:
@@ -135,3 +141,12 @@ def test_parallel_cameras_get_points_in_front_of_them() -> None:
     positions = fallback_points(cameras, 100).positions
     assert np.isfinite(positions).all()
     assert (positions[:, 2] > 0).all()
+
+
+def test_the_distance_of_neighbours_is_that_of_the_three_nearest_of_all() -> None:
+    points = np.random.default_rng(4).normal(size=(60, 3))
+    every = np.linalg.norm(points[:, None] - points[None], axis=2)
+    three = np.sort(every, axis=1)[:, 1:4]
+    np.testing.assert_allclose(neighbour_distance(points), np.sqrt((three**2).mean(axis=1)))
+    assert neighbour_distance(points[:1]).tolist() == [1.0]
+    assert neighbour_distance(points[:2]) == pytest.approx(np.full(2, every[0, 1]))
