@@ -1,4 +1,4 @@
-"""Counts docstrings that are fragments: those that only continue the name above them ("Of the run, 0 to 1.").
+"""Counts docstrings, and texts of options, that are fragments: they only continue the name above them ("Of the run.").
 
     python tools/docstrings.py
 
@@ -7,6 +7,7 @@ with the thing that is meant.
 """
 
 import ast
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,12 +21,31 @@ PREPOSITIONS = frozenset({
 def fragments(folder: Path) -> Iterator[str]:
     """Yield `file:line name: docstring` for every fragment in a folder."""
     for file in sorted(folder.rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-                continue
-            text = ast.get_docstring(node)
-            if text and is_fragment(text):
-                yield f"{file}:{node.lineno} {node.name}: {text.splitlines()[0]}"
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        for line, name, text in sorted((*docstrings(tree), *options(tree))):
+            if is_fragment(text):
+                yield f"{file}:{line} {name}: {text.splitlines()[0]}"
+
+
+def docstrings(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
+    """Yield line, name and docstring of each function and class."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.lineno, node.name, ast.get_docstring(node) or ""
+
+
+def options(tree: ast.Module) -> Iterator[tuple[int, str, str]]:
+    """Yield the same of each field with a text below it, as the help of the command line shows it."""
+    for node in ast.walk(tree):
+        for field, below in itertools.pairwise(node.body) if isinstance(node, ast.ClassDef) else ():
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(field.target, ast.Name)
+                and isinstance(below, ast.Expr)
+                and isinstance(below.value, ast.Constant)
+                and isinstance(below.value.value, str)
+            ):
+                yield field.lineno, field.target.id, below.value.value
 
 
 def is_fragment(text: str) -> bool:

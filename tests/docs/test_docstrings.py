@@ -21,6 +21,13 @@ def test_what_begins_with_a_preposition_is_a_fragment(text: str, tmp_path: Path)
     assert found.endswith(f"code.py:1 progress: {text}")
 
 
+def test_the_text_of_an_option_is_looked_at_too(tmp_path: Path) -> None:
+    code = 'class Command:\n    width: int = 320\n    """Of the images."""\n    height: int = 240\n    """Pixels."""\n'
+    (tmp_path / "code.py").write_text(code, encoding="utf-8")
+    (found,) = fragments(tmp_path)
+    assert found.endswith("code.py:2 width: Of the images.")
+
+
 @pytest.mark.parametrize(
     "text", ["Return the fraction of the run, 0 to 1.", "[N, 3] positions of the anchors.", ""]
 )

@@ -79,7 +79,7 @@ class Compress(ComputingCommand, LevelOption):
     """Training steps, one view each; all schedules scale with it."""
 
     seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
-    """Of every random choice, that of the cameras included."""
+    """Seed of every random choice, that of the cameras included."""
 
     views: Annotated[int, arg(metavar="N")] = 200
     """Places to look from. Of --cameras every 8th is kept for judging; if the others are fewer, more are placed

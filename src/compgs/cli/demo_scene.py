@@ -34,13 +34,13 @@ class DemoScene(Command):
     """Number of views."""
 
     width: Annotated[int, arg(metavar="PIXELS")] = 320
-    """Of the images."""
+    """Width of the images."""
 
     height: Annotated[int, arg(metavar="PIXELS")] = 240
-    """Of the images."""
+    """Height of the images."""
 
     seed: Annotated[int, arg(metavar="N")] = 0
-    """Of everything random."""
+    """Seed of everything random."""
 
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace a scene that is in FOLDER already."""

@@ -43,8 +43,8 @@ class Export(DecodingCommand, SceneFileArgument, LevelOption):
     """The file to write; what it becomes is said by what its name ends in."""
 
     degree: Annotated[int | None, arg(metavar="N", help_behavior_hint=NO_DEFAULT)] = None
-    """Of the harmonics, 0 (the same color from everywhere) to 3. By default 3; with --max-bytes the highest with which
-    all splats fit, 1 at least."""
+    """Degree of the harmonics, 0 (the same color from everywhere) to 3. By default 3; with --max-bytes the highest with
+    which all splats fit, 1 at least."""
 
     refine: Annotated[int, arg(metavar="STEPS")] = 100
     """Steps in which baked splats are fitted to the scene's own pictures; 0 is faster."""
@@ -56,7 +56,7 @@ class Export(DecodingCommand, SceneFileArgument, LevelOption):
     """Keep as many as fit into a file of this size, such as 2MB or 500kB."""
 
     spz_version: Literal[3, 4] = 3
-    """Of .spz files: 4 is a little smaller, and read by newer programs only (needs `pip install '.[spz]'` in the
+    """Version of .spz files: 4 is a little smaller, and read by newer programs only (needs `pip install '.[spz]'` in the
     project's folder)."""
 
     overwrite: FlagCreatePairsOff[bool] = False

@@ -11,4 +11,4 @@ class LevelOption:
     """A level of detail."""
 
     level: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0, the finest)")] = None
-    """Of a lod-meta.json, a streamed .sog of several levels of detail: which one is opened."""
+    """Level that is opened of a lod-meta.json, which is a streamed .sog of several levels of detail."""

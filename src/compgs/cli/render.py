@@ -111,13 +111,13 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
     elevation: Annotated[
         float | None, arg(metavar="DEGREES", help_behavior_hint=f"(default: {ELEVATIONS[0]:g})")
     ] = None
-    """Of the circle, above the horizon; by default higher where it would lead through something."""
+    """Height of the circle above the horizon; by default more where it would lead through something."""
 
     distance: Annotated[
         float | None, arg(metavar="RADII", help_behavior_hint=f"(default: {DISTANCES[0]:g})")
     ] = None
-    """Of the circle from the middle of the scene; by default another one where it would lead through something, or
-    where a file without cameras holds an object that would not be whole in the pictures."""
+    """Distance of the circle from the middle of the scene; by default another one where it would lead through something,
+    or where a file without cameras holds an object that would not be whole in the pictures."""
 
     label: Annotated[str | None, arg(metavar="TEXT", help_behavior_hint=NO_DEFAULT)] = None
     """Words in the lower left corner of each picture; {bytes} stands for the size of the file."""

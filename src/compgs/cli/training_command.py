@@ -87,7 +87,7 @@ class TrainingCommand(ComputingCommand, SceneOptions):
     """Training steps, one view each (--set training.views_per_step: more); all schedules scale with it."""
 
     seed: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
-    """Of every random choice: the same seed on the same CPU gives the same file."""
+    """Seed of every random choice: the same seed on the same CPU gives the same file."""
 
     cameras: Annotated[str | None, arg(metavar="N|none", help_behavior_hint="(default: 12)")] = None
     """Cameras of training views that the file keeps, chosen to stand for all of them: where viewers and exports look
