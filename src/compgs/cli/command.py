@@ -129,8 +129,8 @@ class MemoryOption:
     memory: Annotated[
         str | None, arg(metavar="SIZE", help_behavior_hint="(default: half of the machine's)")
     ] = None
-    """Memory that open tiles of a scene in tiles may take, such as 500MB or 2GB; others are opened again when they are in
-    view. The pictures are the same."""
+    """Memory that open tiles of a scene in tiles may take, such as 500MB or 2GB; others are opened again when they are
+    in view. The pictures are the same."""
 
     def allow_memory(self) -> None:
         """Raises UsageError for what is no size."""

@@ -56,8 +56,8 @@ class Export(DecodingCommand, SceneFileArgument, LevelOption):
     """Keep as many as fit into a file of this size, such as 2MB or 500kB."""
 
     spz_version: Literal[3, 4] = 3
-    """Version of .spz files: 4 is a little smaller, and read by newer programs only (needs `pip install '.[spz]'` in the
-    project's folder)."""
+    """Version of .spz files: 4 is a little smaller, and read by newer programs only (needs `pip install '.[spz]'` in
+    the project's folder)."""
 
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace OUT if it is there already."""

@@ -116,8 +116,8 @@ class Render(DecodingCommand, SceneOptions, SceneFileOrRunArgument, LevelOption,
     distance: Annotated[
         float | None, arg(metavar="RADII", help_behavior_hint=f"(default: {DISTANCES[0]:g})")
     ] = None
-    """Distance of the circle from the middle of the scene; by default another one where it would lead through something,
-    or where a file without cameras holds an object that would not be whole in the pictures."""
+    """Distance of the circle from the middle of the scene; by default another one where it would lead through
+    something, or where a file without cameras holds an object that would not be whole in the pictures."""
 
     label: Annotated[str | None, arg(metavar="TEXT", help_behavior_hint=NO_DEFAULT)] = None
     """Words in the lower left corner of each picture; {bytes} stands for the size of the file."""
