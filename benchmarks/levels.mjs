@@ -11,6 +11,11 @@ import { fileURLToPath } from "node:url";
 
 const web = fileURLToPath(new URL("../web/", import.meta.url));
 const { build } = createRequire(`${web}package.json`)("esbuild");
+/** The kernels are those that `make web` has built. */
+function setup({ onResolve }) {
+  const path = new URL("../web/dist/compgs.js", import.meta.url).href;
+  onResolve({ filter: /\/wasm_kernels\.ts$/ }, () => ({ path, external: true }));
+}
 const modules = ["src/tiles/manifest", "src/tiles/loader", "src/tiles/detail", "src/prediction/predictor"];
 const { outputFiles } = await build({
   stdin: {
@@ -28,6 +33,7 @@ const { outputFiles } = await build({
   target: "es2022",
   minify: true,
   write: false,
+  plugins: [{ name: "kernels", setup }],
 });
 const source = Buffer.from(outputFiles[0].text).toString("base64");
 const { TileLoader, Predictor, SplatStore, isInView, planDetail, readManifest, rowsOf, sizeOf } = await import(
