@@ -2,11 +2,18 @@
 
 import { type AppBase, GSPLATDATA_LARGE, SHADERLANGUAGE_GLSL, ShaderChunks } from "playcanvas";
 import { CUTOFF } from "../viewer/splatting.ts";
+import { EDGE } from "./jacobian.ts";
 
 /** What the engine adds to the variances of splats, and their least, as its shader has it: in half pixels, squared. */
 const ENGINE_DILATION = /\+ 0\.3\b/g;
 const ENGINE_LEAST_VARIANCE = /max\(mid - radius, 0\.1\)/;
 const HALF_PIXELS = 4; // in a pixel^2
+/** How the engine takes the Jacobian at a splat's middle: far outside of the picture that smears it across all of it. */
+const ENGINE_JACOBIAN = "vec2 J2 = -J1 / vp.z * vp.xy;";
+/** The same where the middle is in the picture or near it; held there beyond, as in training. */
+const JACOBIAN = /* glsl */ `
+  vec2 edge = ${EDGE} / abs(vec2(center.projMat00, center.projMat11));
+  vec2 J2 = J1 * clamp(-vp.xy / vp.z, -edge, edge);`;
 /** How far a splat reaches, half of it: sqrt(8) standard deviations. */
 const ENGINE_REACH = /sqrt\(2\.0 \* (lambda[12])\)/g;
 /** Times that: to where the alpha of an opaque splat is the least that is drawn. */
@@ -41,11 +48,13 @@ export function drawAsTrained(app: AppBase): void {
   gsplat.alphaClipForward = LEAST_ALPHA;
   const chunks = gsplat.material.getShaderChunks(SHADERLANGUAGE_GLSL);
   const corner = ShaderChunks.get(app.graphicsDevice, SHADERLANGUAGE_GLSL).get("gsplatCornerVS") ?? "";
-  const isKnown = [ENGINE_DILATION, ENGINE_LEAST_VARIANCE, ENGINE_REACH].every((part) => corner.match(part));
+  const parts = [ENGINE_DILATION, ENGINE_LEAST_VARIANCE, ENGINE_REACH];
+  const isKnown = parts.every((part) => corner.match(part)) && corner.includes(ENGINE_JACOBIAN);
   if (isKnown) {
     const trained = corner
       .replaceAll(ENGINE_DILATION, `+ ${UNIFORM}`)
       .replace(ENGINE_LEAST_VARIANCE, `max(mid - radius, ${UNIFORM})`)
+      .replace(ENGINE_JACOBIAN, JACOBIAN)
       .replaceAll(ENGINE_REACH, `${REACH.toFixed(6)} * sqrt(2.0 * $1)`);
     chunks.set("gsplatCornerVS", `uniform float ${UNIFORM};\n${trained}`);
   } else

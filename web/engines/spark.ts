@@ -23,6 +23,7 @@ import { LiveScene, type Splats } from "../src/live/live_scene.ts";
 import type { SceneInfo } from "../src/scene_info.ts";
 import { type Source, isCgs } from "../src/sources.ts";
 import { CUTOFF, dilationOf } from "../viewer/splatting.ts";
+import { EDGE } from "./jacobian.ts";
 import type { ShownOptions } from "./options.ts";
 import { viewpointCamera, viewpointTarget } from "./three_view.ts";
 
@@ -161,8 +162,30 @@ export function registerCgs(manager: LoadingManager): void {
 }
 
 /**
+ * Lines of Spark's vertex shader, and what stands in their place. Spark takes the Jacobian of the projection at a splat's
+ * middle, which far outside of the picture smears a splat across all of it; and the smaller variance of a splat in the
+ * picture is a difference of large numbers, without a digit that is right where it is long and thin.
+ */
+const AS_TRAINED = [
+  [
+    "vec2 J2 = -(J1 * viewCenter.xy) * invZ;",
+    `vec2 sides = vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
+     vec2 shift = projectionMatrix[2].xy;
+     vec2 J2 = J1 * clamp(-viewCenter.xy * invZ, (shift - ${EDGE}) / sides, (shift + ${EDGE}) / sides);`,
+  ],
+  [
+    "float eigen2 = eigenAvg - eigenDelta;",
+    "float eigen2 = max(det / eigen1, preBlurAmount + fullBlurAmount);",
+  ],
+] as const;
+/** Halves of the picture beyond which splats are left out: large ones that lie outside reach into it. */
+const CLIP = 1e3;
+/** The same where the shader is another and nothing is clamped. */
+const CLIP_UNCLAMPED = 2;
+
+/**
  * Spark's renderer as .cgs files want it: splats widened as in their training, without a loss of opacity, sorted by
- * depth, and not rounded further on their way.
+ * depth, those outside of the picture as in training, and not rounded further on their way.
  */
 export class CgsSparkRenderer extends SparkRenderer {
   constructor(options: SparkRendererOptions) {
@@ -174,9 +197,19 @@ export class CgsSparkRenderer extends SparkRenderer {
       maxStdDev: Math.sqrt(-2 * Math.log(CUTOFF)),
       minAlpha: CUTOFF,
       maxPixelRadius: 1e4,
-      clipXY: 2,
+      clipXY: CLIP,
       ...options,
     });
+    if (AS_TRAINED.every(([line]) => this.material.vertexShader.includes(line))) {
+      for (const [line, better] of AS_TRAINED) {
+        this.material.vertexShader = this.material.vertexShader.replace(line, better);
+      }
+    } else {
+      console.warn(
+        "compgs: this version of Spark has another shader: splats outside of the picture are left out.",
+      );
+      this.clipXY = options.clipXY ?? CLIP_UNCLAMPED;
+    }
   }
 
   override onBeforeRender(...[renderer, scene, camera]: Parameters<SparkRenderer["onBeforeRender"]>): void {
