@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import re
 import typing
 from dataclasses import asdict, replace
 from typing import Annotated, Literal
@@ -19,6 +20,7 @@ from compgs.config import (
 from compgs.errors import ConfigError
 from compgs.former_settings import FORMER
 from compgs.former_settings import VARIANTS as FORMER_VARIANTS
+from compgs.training.plan import RULES
 from compgs.training.structure.variants import VARIANTS
 
 
@@ -181,11 +183,20 @@ def test_the_control_of_earlier_versions_is_one_of_the_variants() -> None:
         config_from_dict({"control": {"opacity_views": 7}})
 
 
+def test_rules_that_former_settings_name_are_there() -> None:
+    named = {rule for former in FORMER.values() for rule in re.findall(r"all but ([^']+)'", former.instead)}
+    known = {rule.name for rule in RULES}
+    assert named and all(set(names.split(", ")) <= known for names in named)
+
+
 def test_settings_of_earlier_versions_that_would_matter_are_refused_with_what_to_do() -> None:
     for section, key, value in (
         ("training", "rate_every", 8),
         ("training", "color_lr", [1e-3, 1e-4]),
         ("training", "appearance_dtype", "bfloat16"),
+        ("training", "head_optimizer", "soap"),
+        ("model", "networks_by_price", False),
+        ("control", "prune_share", 0.02),
     ):
         values = Config().to_dict()
         values[section][key] = value

@@ -24,6 +24,11 @@ def _of_rule(value: float, without: float, rule: str) -> Former:
     return Former((value, without), f"it is {value:.3g}, or off: --set training.rules='all but {rule}'")
 
 
+def _became_rule(value: Any, *rules: str) -> Former:
+    """A setting that decided for itself whether it applied: rules do so now, unless they are left out."""
+    return Former((value,), f"--set training.rules='all but {', '.join(rules)}' turns it off")
+
+
 def _of_heads(*value: float) -> Former:
     """A learning rate of the heads: they are constants of `compgs.training.optimizers` now."""
     return Former(
@@ -44,6 +49,14 @@ def _of_steps() -> Former:
 
 
 FORMER = {
+    "model.residuals_where_few": _became_rule(1e-3, "own_residuals_few"),
+    "model.residuals_where_many": _became_rule(1e-5, "own_residuals_many"),
+    "model.twice_coupled_where_few": _became_rule(1e-4, "twice_coupled"),
+    "model.separate_where_long": _became_rule(1e-5, "separate_heads"),
+    "model.sharp_where_many": _became_rule(0.002, "sharp"),
+    "model.networks_by_price": _became_rule(
+        True, "width_16", "width_8", "no_context", "one_bit_less", "two_bits_less"
+    ),
     "model.voxel_rate_exponent": _of_rule(1 / 6, 0.0, "coarser_grid"),
     "control.rate_exponent": _of_rule(1 / 3, 0.0, "growth"),
     "control.prune_less": _of_rule(0.5, 0.0, "bit_discount"),
@@ -56,6 +69,12 @@ FORMER = {
     "training.covariance_lr": _of_heads(4e-3, 4e-5),
     "training.opacity_lr": _of_heads(2e-3, 2e-5),
     "training.color_lr": _of_heads(8e-3, 8e-5),
+    "training.head_optimizer": Former(("adam",), "Adam moves the heads, too"),
+    "training.sparse_adam": Former((False,), "Adam moves all anchors in every step"),
+    "training.anchor_memory": Former((1000.0,), "Adam remembers the squared gradients of 1 000 steps"),
+    "control.prune_share": Former(
+        (), "anchors go that are not worth their bits: --set control.prune_worth=PRICE"
+    ),
     "training.checkpoint_minutes": Former(None, "a checkpoint is written every five minutes"),
     "training.head_warm_up": _of_phases("warm"),
     "training.rate_start": _of_phases("rate"),
