@@ -190,6 +190,15 @@ def test_kernels_and_plain_torch_agree_on_features_and_gradients() -> None:
     assert found[0][1].abs().sum() > 0
 
 
+def test_plain_torch_copies_nothing_to_the_device_after_its_first_call(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    places, grid = torch.rand(5, 3), torch.rand(219, 2)
+    features_reference(places, grid, LAYOUT)
+    monkeypatch.setattr(torch, "tensor", None)
+    assert features_reference(places, grid, LAYOUT).shape == (5, 8)
+
+
 def test_the_opened_network_gives_the_colors_of_the_trained_one() -> None:
     grid = RNG.normal(size=(219, 2)).astype(np.float32)
     weights = [RNG.normal(size=shape).astype(np.float32) / 5 for shape in network_shapes(8)]

@@ -1,5 +1,6 @@
 """The hash grid and the color network on torch tensors, with gradients (`hash_grid.py`, `color_network.py`)."""
 
+import functools
 from typing import Any
 
 import torch
@@ -27,8 +28,7 @@ def features_reference(places: Tensor, grid: Tensor, layout: GridLayout) -> Tens
         cell = scaled.detach().long().clamp(0, int(cells) - 1)
         within = scaled - cell
         total = torch.zeros(len(places), layout.features, dtype=grid.dtype, device=grid.device)
-        for corner in range(8):
-            step = torch.tensor([corner & 1, (corner >> 1) & 1, corner >> 2], device=places.device)
+        for step in corners(places.device):
             weight = torch.where(step.bool(), within, 1 - within).prod(1)
             x, y, z = (cell + step).unbind(1)
             side = int(cells) + 1
@@ -39,6 +39,14 @@ def features_reference(places: Tensor, grid: Tensor, layout: GridLayout) -> Tens
             total = total + weight[:, None].to(grid.dtype) * grid[int(first) + row]
         parts.append(total)
     return torch.cat(parts, 1)
+
+
+@functools.lru_cache(maxsize=16)
+def corners(device: torch.device) -> Tensor:
+    """[8, 3] int64: steps from a node of a grid to the corners of its cell; kept, as a copy to a GPU waits for it to
+    finish its work.
+    """
+    return torch.tensor([[corner & 1, (corner >> 1) & 1, corner >> 2] for corner in range(8)], device=device)
 
 
 class _Features(torch.autograd.Function):
