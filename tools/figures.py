@@ -151,6 +151,7 @@ def printed(name: str) -> str:
 
 
 SHOWN = {
+    "city": "16 blocks of houses, made by `tools/made_city.py`, seen from the air",
     "brighton": "a park by a lake, from 18 photographs of a drone; they leave the trees blurred",
     "demo": "balls, boxes and a floor, made by `compgs demo-scene` and trained by `make demo`",
 }

@@ -1,10 +1,10 @@
 """Makes the pictures of the site's task pages, docs/images/task_*.webp.
 
-    compgs demo-scene demo/scene
-    python tools/task_pictures.py docs/gallery/demo.cgs demo/scene
+    python tools/made_city.py scenes/city
+    python tools/task_pictures.py docs/gallery/city.cgs scenes/city
 
-They show the demo's scene, which the program makes itself, and its file. task_look and task_share are screenshots of
-the program's own pages: `compgs export demo.cgs demo.html`, and `compgs serve docs/gallery`.
+They show the made-up city and its file. task_look and task_share are screenshots of the program's own pages:
+`compgs export city.cgs city.html`, and `compgs serve docs/gallery`.
 """
 
 import argparse
@@ -12,6 +12,7 @@ import csv
 import io
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -23,6 +24,7 @@ import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
 import compgs
+from compgs.evaluation.camera_path import look_at
 from compgs.metrics import psnr, to_8bit
 from compgs.outputs import write_bytes
 from compgs.reconstruct.report import picture
@@ -76,25 +78,85 @@ def photographs(scene: Path) -> None:
 
 
 def comparison(file: Path, scene: Scene) -> None:
-    """A file, its export, and their difference; and what a few lines of Python give."""
+    """A file, its export, and their difference."""
     camera = scene.test_views[0].camera
     ours = to_8bit(compgs.render(compgs.decode(file), camera).image)
     with tempfile.TemporaryDirectory() as folder:
-        other = Path(folder) / "demo.spz"
+        other = Path(folder) / f"{file.stem}.spz"
         compgs.export(file, other, refine=0, progress=False)
         theirs = to_8bit(compgs.render(compgs.open_scene(other), camera).image)
-        captions = [f"demo.cgs, {size(file.stat().st_size)}", f"demo.spz, {size(other.stat().st_size)}"]
+        captions = [f"{path.name}, {size(path.stat().st_size)}" for path in (file, other)]
     difference = np.clip(8 * np.abs(ours.astype(int) - theirs), 0, 255).astype(np.uint8)
     captions.append(f"difference times 8; {psnr(ours, theirs):.1f} dB")
     save(beside([Image.fromarray(image) for image in (ours, theirs, difference)], captions), "compare")
-    photograph = scene.test_views[0].image
-    captions = [
-        "scene.test_views[0].image",
-        "compgs.render(model, camera).image",
-        f"PSNR {psnr(ours, photograph):.1f} dB",
+
+
+def lines_of_python(file: Path, scene: Scene) -> None:
+    """A photograph, its view rendered from a file, and their difference."""
+    view = scene.train_views[0]
+    rendered = to_8bit(compgs.render(compgs.decode(file), view.camera).image)
+    difference = np.clip(4 * np.abs(rendered.astype(int) - view.image), 0, 255).astype(np.uint8)
+    captions = ["view.image", "compgs.render(model, view.camera).image", "difference times 4"]
+    save(beside([Image.fromarray(image) for image in (view.image, rendered, difference)], captions), "python")
+
+
+def exports(file: Path) -> None:
+    """The bytes of a file and of its exports."""
+    sizes = {".cgs": file.stat().st_size}
+    with tempfile.TemporaryDirectory() as folder:
+        splats = Path(folder) / f"{file.stem}.ply"  # baked once
+        compgs.export(file, splats, refine=0, progress=False)
+        for suffix in (".spz", ".sog", ".glb", ".ply"):
+            other = splats.with_suffix(suffix)
+            if other != splats:
+                compgs.export(splats, other, progress=False)
+            sizes[suffix] = other.stat().st_size
+    save(bars([f"{file.stem}{suffix}" for suffix in sizes], list(sizes.values())), "export")
+
+
+def faults(file: Path, scene: Scene) -> None:
+    """A file from three places: near the photographs, where none was taken, and far outside."""
+    model, camera = compgs.decode(file), scene.test_views[0].camera
+    up = np.array([0.0, 0.0, 1.0])
+    poses = [
+        camera.world_to_camera,
+        look_at(np.array([0.0, -3.4, 0.3]), np.array([0.0, 0.0, 0.3]), up),
+        look_at(np.array([0.0, -14.0, 2.0]), np.array([0.0, 0.0, 0.3]), up),
     ]
-    error = np.clip(4 * np.abs(ours.astype(int) - photograph), 0, 255).astype(np.uint8)
-    save(beside([Image.fromarray(image) for image in (photograph, ours, error)], captions), "python")
+    pictures = [
+        Image.fromarray(to_8bit(compgs.render(model, replace(camera, world_to_camera=pose)).image))
+        for pose in poses
+    ]
+    captions = ["near the photographs", "in a street, where none was taken", "far outside"]
+    save(beside(pictures, captions), "remedies")
+
+
+def bars(names: list[str], sizes: list[int]) -> Image.Image:
+    """A bar for each file, with its size; .cgs files stand out."""
+    figure, axis = plt.subplots(figsize=(6, 0.6 + 0.3 * len(names)), layout="constrained")
+    colors = ["#d62728" if ".cgs" in name else "#9db4c8" for name in names[::-1]]
+    drawn_bars = axis.barh(names[::-1], sizes[::-1], color=colors)
+    axis.bar_label(drawn_bars, labels=[size(count) for count in sizes[::-1]], padding=4, fontsize=9)
+    axis.set_xticks([])
+    axis.set_xlim(0, 1.15 * max(sizes))
+    axis.spines[["top", "right", "bottom"]].set_visible(False)
+    return drawn(figure)
+
+
+def processes(scene: Scene) -> None:
+    """Four processes, each with its view, whose gradients are added up."""
+    views = scene.train_views[:: max(1, len(scene.train_views) // 4)][:4]
+    figure, axes = plt.subplots(1, 4, figsize=(9, 2.6))
+    figure.subplots_adjust(left=0.01, right=0.99, top=0.88, bottom=0.3, wspace=0.05)
+    for number, (view, axis) in enumerate(zip(views, axes, strict=True)):
+        axis.imshow(view.image)
+        axis.axis("off")
+        axis.set_title(f"process {number}: its view", fontsize=10)
+        figure.text(0.13 + 0.247 * number, 0.22, "gradients ↓", ha="center", fontsize=9)
+    figure.text(
+        0.5, 0.06, "sum  →  the same step of the same model in every process", ha="center", fontsize=11
+    )
+    save(drawn(figure), "scale")
 
 
 def tiles(scene: Scene) -> None:
@@ -123,6 +185,9 @@ def rates() -> None:
             [int(row["bytes"]) / 1e3 for row in rows], [float(row["psnr"]) for row in rows], "o-", label=scene
         )
     axis.set(xscale="log", xlabel="kB of the file", ylabel="PSNR on held-out views, dB")
+    marks = [2, 5, 10, 20, 50, 100, 200]
+    axis.set_xticks(marks, [str(mark) for mark in marks])
+    axis.minorticks_off()
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(frameon=False)
     save(drawn(figure), "rates")
@@ -131,23 +196,18 @@ def rates() -> None:
 def compress() -> None:
     """Bytes of splats as .spz, .sog and .cgs, from the page of results."""
     text = (ROOT / "docs" / "results" / "compress.md").read_text(encoding="utf-8")
-    names, sizes = [], []
+    names: list[str] = []
+    sizes: list[int] = []
     scene = ""
     for line in text.partition("## 8 000 steps")[2].splitlines():
         cells = [cell.strip() for cell in line.split("|")[1:-1]]
         if len(cells) == 7 and cells[1].strip("`") in (".spz", ".sog", ".cgs"):
             scene = cells[0] or scene
             names.append(f"{scene}, {cells[1].strip('`')}")
-            sizes.append(int(cells[2].replace(" ", "")) / 1e6)
+            sizes.append(int(cells[2].replace(" ", "")))
         elif sizes and line.startswith("## "):
             break
-    figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
-    axis.barh(
-        names[::-1], sizes[::-1], color=["#d62728" if ".cgs" in name else "#9db4c8" for name in names[::-1]]
-    )
-    axis.set_xlabel("MB of the file")
-    axis.spines[["top", "right"]].set_visible(False)
-    save(drawn(figure), "compress")
+    save(bars(names, sizes), "compress")
 
 
 def main() -> None:
@@ -162,7 +222,11 @@ def main() -> None:
     photographs(asked.scene)
     scene = compgs.load_scene(asked.scene)
     tiles(scene)
+    processes(scene)
     comparison(asked.file, scene)
+    lines_of_python(asked.file, scene)
+    exports(asked.file)
+    faults(asked.file, scene)
 
 
 if __name__ == "__main__":
