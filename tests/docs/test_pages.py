@@ -53,6 +53,18 @@ def test_every_file_of_the_gallery_opens_and_makes_a_page() -> None:
         assert len(html_page(file.read_bytes(), file.stem)) > file.stat().st_size
 
 
+def test_every_setting_that_a_page_names_is_one_of_today() -> None:
+    today = config.load_config("default").to_dict()
+    sections = "|".join(name for name in today if isinstance(today[name], dict))
+    named = re.compile(rf"`(?:--set )?({sections})\.([a-z_]+)[`=]")
+    found = 0
+    for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
+        for section, name in named.findall(page.read_text(encoding="utf-8")):
+            assert name in today[section] or name == "json", f"{page.name}: {section}.{name}"
+            found += 1
+    assert found > 50
+
+
 def test_the_reference_has_every_name_of_the_package_where_it_is_written() -> None:
     page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     told = re.findall(r"^::: ([\w.]+)$", page, flags=re.MULTILINE)
@@ -64,3 +76,16 @@ def test_the_reference_has_every_name_of_the_package_where_it_is_written() -> No
         found = getattr(importlib.import_module(module), name)
         given = getattr(importlib.import_module(compgs._HOME[name]), name)
         assert found is given and found.__module__ == module, path
+
+
+def test_every_link_outside_of_the_site_leads_to_a_file() -> None:
+    pages = [
+        ROOT / name for name in ("README.md", "CONTRIBUTING.md", "conformance/README.md", "web/README.md")
+    ]
+    found = 0
+    for page in pages:  # mkdocs checks the links within docs/
+        text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        for link in re.findall(r"\]\(([^)\s#]+)[^)]*\)", text):
+            assert "://" in link or (page.parent / link).exists(), f"{page.relative_to(ROOT)}: {link}"
+            found += 1
+    assert found > 30
