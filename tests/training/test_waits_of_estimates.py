@@ -13,7 +13,10 @@ from compgs.entropy.quantization import WeightRounding, quantize_weight
 from compgs.tensors import where
 from compgs.training.rate.file_size import fixed_bytes
 from compgs.training.run.shown_size import ShownSize
+from compgs.training.step import pictures
 from compgs.training.trainer import Trainer
+
+from .test_waiting import rasterize_nothing
 
 CPU = torch.device("cpu")
 READS = {"item", "tolist", "cpu", "numpy", "__bool__", "__float__", "__int__", "__index__", "nonzero"}
@@ -31,15 +34,21 @@ class Reads(TorchFunctionMode):
         return function(*args, **(kwargs or {}))
 
 
-class Largest(TorchDispatchMode):
-    """The most numbers that an operation has given."""
+class Operations(TorchDispatchMode):
+    """How many operations there were, but for those that only look at a tensor in another way, and the most numbers
+    that one has given.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self.numbers = 0
+        self.count = self.numbers = 0
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         found = function(*args, **(kwargs or {}))
+        views = (
+            each.alias_info is not None and not each.alias_info.is_write for each in function._schema.returns
+        )
+        self.count += not any(views)
         for each in found if isinstance(found, tuple) else (found,):
             self.numbers = max(self.numbers, each.numel() if isinstance(each, Tensor) else 0)
         return found
@@ -143,6 +152,28 @@ def test_neighbours_are_summed_without_a_copy_of_each(monkeypatch) -> None:
     found = neighbours.neighbourhood(coordinates)
     latents, rows = torch.randn(len(coordinates), 32, generator=chance), torch.arange(0, len(coordinates), 2)
     assert found.anchors.shape[1] > 4
-    with Largest() as largest:
+    with Operations() as operations:
         found.around(latents, torch.zeros(32), rows)
-    assert largest.numbers == len(coordinates) * (32 + 2), "what each anchor says, once"
+    assert operations.numbers == len(coordinates) * (32 + 2), "what each anchor says, once"
+
+
+@pytest.mark.parametrize("views", [1, 4])
+def test_a_step_with_rounded_weights_has_few_operations_more(
+    blob_scene, tiny_config, monkeypatch, views
+) -> None:
+    """Each of 18 weights by itself would take some thirty in each view."""
+    monkeypatch.setattr(where, "in_kernels", lambda *tensors: False)
+    monkeypatch.setattr(where, "runs_in_kernels", lambda device, *dtypes: False)
+    monkeypatch.setattr(where, "choosing_pays", lambda device: False)
+    monkeypatch.setattr(pictures, "rasterize", rasterize_nothing)
+    config = replace(tiny_config, training=replace(tiny_config.training, views_per_step=views))
+    trainer = Trainer(blob_scene, config, CPU)
+    counts = {}
+    for step in (29, 33):  # the second with weights as stored; nothing else is due
+        for _ in range(2):
+            trainer.step = step
+            with Operations() as operations:
+                trainer.train_step()
+        counts[step] = operations.count
+    assert trainer.config.training.borders.weights == 32 / 40
+    assert 0 < counts[33] - counts[29] < 120 + 40 * views
