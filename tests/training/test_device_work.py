@@ -9,7 +9,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from compgs.entropy import neighbourhood as neighbours
-from compgs.entropy.quantization import WeightRounding, quantize_weight
+from compgs.entropy.quantization import WeightRounding, quantize_weight, quantize_weights
 from compgs.tensors import where
 from compgs.training.rate.file_size import fixed_bytes
 from compgs.training.run.shown_size import ShownSize
@@ -111,7 +111,7 @@ def test_several_weights_are_rounded_as_each_by_itself() -> None:
     weights = [torch.randn(shape, generator=chance) * size for shape, size in SHAPES]
     weights[2][:] = 0
     bits = [7, 8, 12, 5, 16]
-    found = WeightRounding.of(weights, bits).applied(weights)
+    found = quantize_weights(weights, bits)
     for weight, count, stored in zip(weights, bits, found, strict=True):
         assert torch.equal(stored, quantize_weight(weight, count))
 

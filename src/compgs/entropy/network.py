@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from compgs.entropy.quantization import quantize_weight
+from compgs.entropy.quantization import quantize_weights
 from compgs.tensors.linear import ReferenceLayer, linear
 
 # A power of two, so that the decoder's leaky ReLU is a shift.
@@ -108,15 +108,13 @@ class EntropyNetwork(nn.Module):
 
     def layers(self, bits: int | None = None) -> list[tuple[Tensor, Tensor]]:
         """Effective (weight [out, in], bias [out]) of each layer; rounded to `bits` bits if given."""
-        result = []
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            if i == len(self.weights) - 1:
-                weight = weight * self.gain[:, None]
-                bias = bias * self.gain + self.offset
-            if bits is not None:
-                weight, bias = quantize_weight(weight, bits), round_fixed(bias)
-            result.append((weight, bias))
-        return result
+        weights, biases = [*self.weights], [*self.biases]
+        weights[-1] = weights[-1] * self.gain[:, None]
+        biases[-1] = biases[-1] * self.gain + self.offset
+        if bits is not None:
+            weights = quantize_weights(weights, [bits] * len(weights))
+            biases = [round_fixed(bias) for bias in biases]
+        return list(zip(weights, biases, strict=True))
 
     def inputs_of_last(self, x: Tensor, bits: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """What the last layer takes of x [N, inputs], and its weight [2 C, in] and bias [2 C]."""

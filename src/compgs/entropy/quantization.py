@@ -148,6 +148,13 @@ class WeightRounding:
         return [part.view(weight.shape) for part, weight in zip(parts, weights, strict=True)]
 
 
+def quantize_weights(weights: Sequence[Tensor], bits: Sequence[int]) -> list[Tensor]:
+    """Each of the weights as `quantize_weight` gives it, in few operations however many they are."""
+    if len(weights) == 1:
+        return [quantize_weight(weights[0], bits[0])]
+    return WeightRounding.of(weights, bits).applied(weights)
+
+
 def _joined(weights: Sequence[Tensor]) -> Tensor:
     return torch.cat([weight.reshape(-1) for weight in weights])
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from compgs.entropy.gaussian import gaussian_bits
 from compgs.entropy.network import EntropyNetwork, leaky, round_fixed
-from compgs.entropy.quantization import quantize, quantize_weight, round_straight_through
+from compgs.entropy.quantization import quantize, quantize_weights, round_straight_through
 from compgs.published.cosa.shape import GROUPS, ChainShape
 from compgs.tensors.linear import linear
 
@@ -47,8 +47,11 @@ class ContextNetwork(nn.Module):
 
     def layers(self, bits: int | None = None) -> list[tuple[Tensor, Tensor]]:
         """Weight [out, in] and bias [out] of each layer; rounded to `bits` bits if given."""
-        layers = list(zip(self.weights, self.biases, strict=True))
-        return layers if bits is None else [(quantize_weight(w, bits), round_fixed(b)) for w, b in layers]
+        weights, biases = [*self.weights], [*self.biases]
+        if bits is not None:
+            weights = quantize_weights(weights, [bits] * len(weights))
+            biases = [round_fixed(bias) for bias in biases]
+        return list(zip(weights, biases, strict=True))
 
 
 @dataclass(frozen=True)

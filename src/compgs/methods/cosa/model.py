@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from compgs.codec.encoder import quantized_tensor
 from compgs.codec.integer_network import FRACTION_BITS
 from compgs.entropy.network import EntropyNetwork
-from compgs.entropy.quantization import in_stored_steps, quantize_weight
+from compgs.entropy.quantization import in_stored_steps, quantize_weights
 from compgs.errors import NotEncodable
 from compgs.methods.anchors.model import AnchorModel
 from compgs.methods.anchors.prediction import AnchorValues
@@ -137,7 +137,9 @@ class CosaModel(AnchorModel):
 
     def stored_weights(self) -> dict[str, Tensor]:
         """Return the rendering networks' weights as the file will hold them, straight-through."""
-        return {name: quantize_weight(w, self.weight_bits(w)) for name, w in self.networks.weights().items()}
+        weights = self.networks.weights()
+        stored = quantize_weights(list(weights.values()), [self.weight_bits(w) for w in weights.values()])
+        return dict(zip(weights, stored, strict=True))
 
     def weight_bits(self, weight: Tensor) -> int:
         """Return the bits of a weight or bias of the rendering networks, in the file."""
