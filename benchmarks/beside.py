@@ -42,7 +42,7 @@ PIECE_SECONDS = 0.02  # of a file, at once
 # Without a change of the picture, after which it was the last.
 QUIET_SECONDS = 3
 QUIET_PICTURES = 5
-MOST_SECONDS = 240
+MOST_SECONDS = 900
 
 # Shows a file in Spark from one camera, and notes when the picture changed, by thumbnails, as looking at them takes no
 # time.
@@ -184,8 +184,10 @@ def of_its_run(file: Path) -> dict[str, Any] | None:
 
 def in_browser(entries: list[Entry], model: Any, options: argparse.Namespace) -> list[dict[str, float]]:
     """Milliseconds to the first and to the last picture."""
+    from viewer import devtools
     from viewer.devtools import tab, until
 
+    devtools.MAX_SECONDS = MOST_SECONDS  # a page that draws by software may answer late
     browser = shutil.which("chromium")
     if browser is None:
         raise SystemExit("no chromium on PATH")
