@@ -22,7 +22,8 @@ from compgs.opening import open_scene
 from compgs.render import render
 from compgs.render.settings import RasterSettings
 from compgs.tensors.reference import rasterize_reference
-from compgs.training import TrainingStatus
+from compgs.training import Plan, TrainingStatus
+from compgs.training.plan import Start, plan
 
 LOOKING = Looking(views=10, held_out=3, width=48, height=36)
 
@@ -159,6 +160,7 @@ def test_given_cameras_are_split_as_scenes_are_and_more_come_between(ball, tmp_p
 
 def test_steps_are_as_many_as_fit_into_the_time(monkeypatch: pytest.MonkeyPatch, config: Config) -> None:
     monkeypatch.setattr(pace, "seconds_per_step", lambda *_: 0.05)
+    monkeypatch.setattr(pace, "plan_for", lambda *_, **__: None)
     fitting = pace.steps_within(None, config, 100.0, None)
     assert abs(fitting.steps - 2000 / pace.WHOLE_RUN) < 20 and fitting.late == 0
     short = pace.steps_within(None, config, 2.0, None)
@@ -186,10 +188,25 @@ def test_a_trial_takes_a_part_of_the_time_only(
 
     monkeypatch.setattr(pace.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(pace, "train", train)
-    plan = SimpleNamespace(with_the_points_at_hand=lambda: None)
-    monkeypatch.setattr(pace, "plan_for", lambda *_: plan)
-    assert pace.seconds_per_step(Views((0,)), config, "cpu", seconds) == 1.0
+    start = Start(1000, 1, 1.0, 1.0, 0.002, 1728, "cpu")
+    assert pace.seconds_per_step(Views((0,)), config, "cpu", plan(config, start), seconds) == 1.0
     assert clock[0] == steps
+
+
+def test_a_run_that_looks_for_points_takes_a_step_as_many_times_as_long_as_it_has_anchors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Plan] = []
+
+    def train(*_, progress, plan, **__):
+        asked.append(plan)
+        progress(SimpleNamespace(step=1, seconds_per_step=1.0))
+
+    monkeypatch.setattr(pace, "train", train)
+    dense = plan(Config(), Start(50_000, 100, 20.0, 30.0, 0.002, 86_400, "cpu"))
+    assert dense.dense_points > 0
+    assert pace.seconds_per_step(Views((0,)), Config(), "cpu", dense) == pace.WITH_POINTS
+    assert asked == [replace(dense, dense_points=0.0)]  # none are looked for in a trial
 
 
 def test_a_time_is_kept_and_its_steps_are_written_down(

@@ -117,7 +117,7 @@ def test_a_run_begins_with_the_dense_points(scene: Scene, found: Points) -> None
     assert plan(config, start).dense_points > 0
     sparse = plan(config, start_of(scene, config, CPU, 300))
     assert sparse.dense_points == 0
-    assert plan(config, start).with_the_points_at_hand().dense_points == 0
+    assert plan(config, replace(start, points_at_hand=True)).dense_points == 0
     few = initial_model(scene, config, CPU, sparse).anchors
     many = initial_model(scene, config, CPU, replace(sparse, dense_points=4.0)).anchors
     # Several of the points share a voxel, which goes by the sparse ones.

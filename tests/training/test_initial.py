@@ -1,5 +1,6 @@
 """What training starts from."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from compgs.scene.points import colors_at
 from compgs.scene.views import Scene
 from compgs.tensors.heads import make_heads
 from compgs.tensors.prediction import predict
+from compgs.training import plan as plan_module
 from compgs.training.plan import grid_spacings
 from compgs.training.start import initial_model
 
@@ -135,3 +137,16 @@ def test_a_run_starts_on_the_grid_that_its_lambda_asks_for(blob_scene: Scene, ti
             dear = replace(config, training=replace(config.training, lmbda=lmbda))
             sizes.append(initial_model(blob_scene, dear).voxel_size)
     assert sizes[1] == pytest.approx(50 ** (1 / 6) * sizes[0]) and sizes[2:] == [0.1, 0.1]
+
+
+def test_a_large_capture_starts_on_a_finer_grid(
+    blob_scene: Scene, tiny_config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = replace(tiny_config, model=replace(tiny_config.model, voxel_size=None))
+    usual = initial_model(blob_scene, free)
+    views = tuple(itertools.islice(itertools.cycle(blob_scene.train_views), 23))
+    monkeypatch.setattr(plan_module, "MANY_ANCHORS", usual.anchors)
+    without = replace(free, training=replace(free.training, rules="all but dense_points"))
+    fine = initial_model(replace(blob_scene, train_views=views), without)
+    assert fine.voxel_size == pytest.approx(0.7 / 1.5 * usual.voxel_size)
+    assert fine.anchors >= usual.anchors and fine.plan.coupled_primitives == 3

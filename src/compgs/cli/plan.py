@@ -65,7 +65,7 @@ def say_expected(plan: "Plan", scene: "Scene", settings: RunSettings, device: st
     if settings.tiles is not None:
         say("time: not known for a capture in tiles")
     else:
-        pace = seconds_per_step(scene, settings.config, device)
+        pace = seconds_per_step(scene, settings.config, device, plan)
         say(
             f"time: about {duration(pace * steps)}, {steps:,} steps at the pace of the first ones, {pace:.3f} s each"
         )

@@ -231,7 +231,7 @@ def begin(
     begun = Begun(source, digest(splats), looking, placed, config)
     run.save(folder_of(output), begun)
     device = chosen_device(device)
-    plan = plan_for(scene, config, training_device(device)).with_the_points_at_hand()
+    plan = plan_for(scene, config, training_device(device), points_at_hand=True)
     return Compression(begun, splats, scene, output, device, plan, deadline=deadline)
 
 
@@ -267,7 +267,7 @@ def resumed(output: Path, source: Path | None = None, *, device: str | None = No
     scene, _ = scene_of(splats, begun.placed, begun.source, begun.config)
     there = (folder / CHECKPOINT_NAME).is_file()
     device = chosen_device(device)
-    plan = plan_for(scene, begun.config, training_device(device)).with_the_points_at_hand()
+    plan = plan_for(scene, begun.config, training_device(device), points_at_hand=True)
     return Compression(begun, splats, scene, output, device, plan, goes_on=there)
 
 

@@ -9,7 +9,7 @@ from compgs.compressing.deadline import FEWEST
 from compgs.config import Config
 from compgs.methods import train
 from compgs.scene.views import Scene
-from compgs.training import TrainingStatus, plan_for
+from compgs.training import Plan, TrainingStatus, plan_for
 from compgs.training.run.run import chosen_device
 
 TRIED = 40  # steps; fewer where these alone would take much of the time
@@ -19,6 +19,9 @@ TRIED_VIEWS = 12
 # A step of the whole run, in steps of its beginning: anchors grow, then most of them are pruned, and the rate is always
 # counted in (measured: docs/results/compress.md).
 WHOLE_RUN = 1.0
+# Anchors of a run that looks for points, in those of one that does not (Truck: docs/results/truck.md). Most of a step's
+# time is for prediction, which takes as many times as long.
+WITH_POINTS = 2.0
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,8 @@ class Fitting:
 def steps_within(scene: Scene, config: Config, seconds: float, device: str | None) -> Fitting:
     """Steps of a training that ends about `seconds` from now."""
     start = time.perf_counter()
-    pace = WHOLE_RUN * seconds_per_step(scene, config, device, seconds)
+    plan = plan_for(scene, config, chosen_device(device), points_at_hand=True)
+    pace = WHOLE_RUN * seconds_per_step(scene, config, device, plan, seconds)
     left = seconds - (time.perf_counter() - start)
     steps = max(FEWEST, int(left / pace))
     return Fitting(steps, max(0.0, steps * pace - left))
@@ -43,16 +47,18 @@ class _Enough(Exception):
 
 
 def seconds_per_step(
-    scene: Scene, config: Config, device: str | None, seconds: float = float("inf")
+    scene: Scene, config: Config, device: str | None, plan: Plan, seconds: float = float("inf")
 ) -> float:
     """Seconds of a step with everything in it, as long as the steps of a run are on average: the first ones look at
     coarse photographs, as in a whole run. The very first, which loads and compiles kernels, does not count.
 
-    The plan is the whole scene's: the few views that are tried would make another one. Of `seconds` the trial takes no
+    The plan is the whole scene's: the few views that are tried would make another one. No points are looked for, which
+    takes minutes; a step of the run takes longer by the anchors that come with them. Of `seconds` the trial takes no
     more than a part.
     """
     end = time.monotonic() + TRIED_PART * seconds
-    plan = plan_for(scene, config, chosen_device(device)).with_the_points_at_hand()
+    anchors = WITH_POINTS if plan.dense_points > 0 else 1.0
+    plan = replace(plan, dense_points=0.0)
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
     told: list[TrainingStatus] = []
 
@@ -63,7 +69,7 @@ def seconds_per_step(
 
     with contextlib.suppress(_Enough):
         train(replace(scene, train_views=views), trial(config), device=device, progress=tell, plan=plan)
-    return fmean(status.seconds_per_step for status in told)
+    return anchors * fmean(status.seconds_per_step for status in told)
 
 
 def trial(config: Config) -> Config:

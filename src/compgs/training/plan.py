@@ -33,9 +33,11 @@ MANY_ANCHORS = 20_000
 # Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
 # up for an error.
 LOOKED_AT, PRUNED_BY = 48, 256
-# Pixels of the photographs between two points that are found in them before a large capture's run: 65 000 points on
-# Truck, half as many as it has. Without them walls and trees stay blurred (docs/results/truck.md).
-POINTS_APART = 12.0
+# Large captures: pixels of the photographs between two points that are found in them before the run, voxels of 0.7
+# spacings where others have 1.5, and coupled primitives of an anchor. What stands where it belongs from the first step
+# on need not grow there, and few primitives around each of many anchors show more than many around few
+# (docs/results/truck.md).
+POINTS_APART, FINER, FEW_COUPLED = 8.0, 0.7 / 1.5, 3
 # What the rules decide by, where it is no yes or no.
 # Where training views are few: share of the primitives that a step does without, and by which pruning counts a bit as
 # cheaper, as what adds little may be all that one view has.
@@ -64,6 +66,8 @@ class Start:
     device: str  # "cpu" or "cuda"
     processes: int = 1  # of a torchrun
     poses_in_doubt: bool = False  # that they are right to a pixel
+    # no points are looked for in the photographs: they show more than a tile, or are pictures of splats
+    points_at_hand: bool = False
 
     @property
     def fewness(self) -> float:
@@ -79,6 +83,11 @@ class Start:
     def large(self) -> bool:
         """Whether anchors are so many that the networks they share hardly count in the file."""
         return self.anchors >= MANY_ANCHORS
+
+    @property
+    def dense(self) -> bool:
+        """Whether points are looked for in the photographs: those of a large capture, if they are many."""
+        return self.large and not self.few and not self.points_at_hand
 
     def often(self, passes: float) -> bool:
         """Whether the run passes over its training views so often."""
@@ -123,6 +132,7 @@ def _voxels(config: Config, start: Start, spacings: float) -> float:
     return spacings * max(1.0, dearer) ** (1 / 6)
 
 
+DENSE = "20,000 anchors and more, 23 training views and more"  # `Start.dense` for people
 # Where two rules set the same value, the later one goes on from what the earlier one chose.
 RULES: tuple[Rule, ...] = (
     Rule(
@@ -133,8 +143,20 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         "dense_points", "dense_points", lambda c, s, pixels: POINTS_APART,
-        "20,000 anchors and more, 10 training views and more: points every 12 pixels, where there are none",
-        lambda s: s.large and s.views >= 10,
+        f"{DENSE}: points every {POINTS_APART:g} pixels, where there are none",
+        lambda s: s.dense,
+        "results/truck.md",
+    ),
+    Rule(
+        "finer_grid", "voxel_spacings", lambda c, s, spacings: FINER * spacings,
+        f"{DENSE}: 0.7 where others have 1.5",
+        lambda s: s.dense,
+        "results/truck.md",
+    ),
+    Rule(
+        "fewer_coupled", "coupled_primitives", lambda c, s, k: min(k, FEW_COUPLED),
+        f"{DENSE}: {FEW_COUPLED} at most, as anchors are close to each other",
+        lambda s: s.dense,
         "results/truck.md",
     ),
     Rule(
@@ -316,11 +338,6 @@ class Plan:
             dilation=self.dilation,
         )
 
-    def with_the_points_at_hand(self) -> "Plan":
-        """The same plan, but no points are looked for in the photographs."""
-        reasons = {name: reason for name, reason in self.reasons.items() if name != "dense_points"}
-        return replace(self, dense_points=0.0, reasons=reasons)
-
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON has it."""
         return dataclasses.asdict(self)
@@ -381,7 +398,7 @@ def decided(name: str, config: Config, start: Start) -> Any:
 
 
 def grid_spacings(config: Config) -> float:
-    """Median distances of the points to a voxel: known before there are anchors."""
+    """Median distances of the points to a voxel, as far as they are known before there are anchors."""
     start = Start(0, 1, 1.0, 1.0, config.training.lmbda, 0, "cpu")
     return float(decided("voxel_spacings", config, start))
 

@@ -26,8 +26,10 @@ from compgs.training.run.seen_points import sightings
 CPU = torch.device("cpu")
 
 
-def start_of(scene: Scene, config: Config, device: torch.device, anchors: int) -> Start:
-    """What is known of a run on a scene that begins with so many anchors."""
+def start_of(
+    scene: Scene, config: Config, device: torch.device, anchors: int, *, points_at_hand: bool = False
+) -> Start:
+    """What is known of a run on a scene that begins with so many anchors, before points are looked for."""
     t, cameras = config.training, [view.camera for view in scene.train_views]
     size = t.target_bytes
     return Start(
@@ -40,16 +42,19 @@ def start_of(scene: Scene, config: Config, device: torch.device, anchors: int) -
         device=device.type,
         processes=world(),
         poses_in_doubt=bool(scene.poses_in_doubt),
+        points_at_hand=points_at_hand,
     )
 
 
-def plan_for(scene: Scene, config: Config, device: torch.device, tiles: int = 1) -> Plan:
+def plan_for(
+    scene: Scene, config: Config, device: torch.device, tiles: int = 1, *, points_at_hand: bool = False
+) -> Plan:
     """What a run on a scene decides; of a capture in so many tiles, for all of their runs. Raises ConfigError."""
     here = local_scene(scene, world_offset(scene))
     anchors = len(anchor_grid(here, replace(config.model, voxel_spacings=grid_spacings(config)))[0])
-    planned = plan(config, start_of(scene, config, device, max(1, round(anchors / tiles))))
-    # A tile's photographs show more than the tile.
-    return planned if tiles == 1 else planned.with_the_points_at_hand()
+    at_hand = points_at_hand or tiles > 1  # a tile's photographs show more than the tile
+    start = start_of(scene, config, device, max(1, round(anchors / tiles)), points_at_hand=at_hand)
+    return plan(config, start)
 
 
 def plan_of(model: TrainedModel, scene: Scene, device: torch.device) -> Plan:
@@ -78,6 +83,9 @@ def initial_model(
     m = replace(config.model, voxel_spacings=spacings)
     coordinates, voxel_size = anchor_grid(scene, m)
     chosen = planned or plan(config, start_of(scene, config, device, len(coordinates)))
+    if chosen.voxel_spacings != spacings:  # many anchors may ask for more
+        m = replace(m, voxel_spacings=chosen.voxel_spacings)
+        coordinates, voxel_size = anchor_grid(scene, m)
     if chosen.dense_points > 0:
         room = m.max_anchors - len(coordinates)
         scene = with_dense_points(scene, chosen.dense_points, room, device)
