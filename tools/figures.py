@@ -121,7 +121,7 @@ def captures(folder: str) -> str:
             f"{results['psnr']:.2f} dB | {results['ssim']:.3f} | **{size(results['bytes'])}** |"
         )
         lines += [
-            f"| {record['title']}, as the paper printed it, {which} | | 30 000 | | {row['psnr']:.2f} dB | "
+            f"| {record['title']}, {which} of the paper | | 30 000 | | {row['psnr']:.2f} dB | "
             f"{row['ssim']:.2f} | {size(row['bytes'])} |"
             for which, row in zip(("largest file", "smallest"), published(record["name"]), strict=False)
         ]
@@ -152,7 +152,7 @@ def printed(name: str) -> str:
 
 SHOWN = {
     "city": "16 blocks of houses, made by `tools/made_city.py`, seen from the air",
-    "brighton": "a park by a lake, from 18 photographs of a drone; they leave the trees blurred",
+    "brighton": "a park by a lake, from 18 photographs that a drone took; they leave the trees blurred",
     "demo": "balls, boxes and a floor, made by `compgs demo-scene` and trained by `make demo`",
 }
 
