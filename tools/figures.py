@@ -111,7 +111,7 @@ def titled(record: Record, link: str) -> str:
 def captures(folder: str) -> str:
     """A row for each record, in a few columns. `folder` leads from the page to docs/results."""
     lines = [
-        "| capture | photographs, pixels | steps | training | PSNR | SSIM | file |",
+        "| capture | training views, pixels | steps | training | PSNR | SSIM | file |",
         "|---|---|---|---|---|---|---|",
     ]
     for record in records():
@@ -266,7 +266,7 @@ def paper() -> str:
         (
             "Fig. 1, quality and size beside other methods",
             "a chart",
-            "a table of eleven methods",
+            "our default beside eleven other files",
             "compared.md",
         ),
         (
