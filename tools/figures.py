@@ -314,7 +314,8 @@ def paper() -> str:
         (
             "Table 7, complexity",
             PRINTED_COMPLEXITY,
-            f"plush, preset `paper`, two CPU cores: {times['train']['seconds'] / 60:.1f} min, {times['encode']['seconds']:.2f} s, "
+            f"plush, preset `paper`, two CPU cores: {times['train']['seconds'] / 60:.1f} min, "
+            f"{times['encode']['seconds']:.2f} s, "
             f"{times['decode']['seconds']:.2f} s, {1e3 * times['render']['seconds']:.0f} ms",
             "results/complexity_plush_480.md",
         ),
