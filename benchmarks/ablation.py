@@ -248,15 +248,19 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("name", choices=list(STUDIES))
+    parser.add_argument("--only", nargs="+", metavar="VARIANT", help="some of the variants")
+    add_training_options(parser, ROOT / "runs" / "ablation")
+    return parser.parse_args(arguments)
+
+
+def add_training_options(parser: argparse.ArgumentParser, runs: Path) -> None:
+    """The scene, where its trainings (by default in `runs`) and tables go, and what `common_arguments` passes on."""
     parser.add_argument("scene", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "results")
-    parser.add_argument(
-        "--runs", type=Path, default=ROOT / "runs" / "ablation", help="folder for the trainings"
-    )
-    parser.add_argument("--only", nargs="+", metavar="VARIANT", help="some of the variants")
+    parser.add_argument("--runs", type=Path, default=runs, help="folder for the trainings")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--steps", type=int, help="default: the preset's")
-    parser.add_argument("--preset", help="default: the default one; `curve` brings its own")
+    parser.add_argument("--preset", help="default: the default one, or what a variant brings")
     parser.add_argument("-r", "--downscale", type=int, default=1)
     parser.add_argument("--threads", type=int)
     parser.add_argument("--lpips", action="store_true")
@@ -264,7 +268,6 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="of all variants"
     )
-    return parser.parse_args(arguments)
 
 
 def common_arguments(options: argparse.Namespace) -> list[str]:

@@ -19,7 +19,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from ablation import ROOT, Variant, common_arguments, run_compgs, run_variant, train_command
+from ablation import (
+    ROOT,
+    Variant,
+    add_training_options,
+    common_arguments,
+    run_compgs,
+    run_variant,
+    train_command,
+)
 from ablation_tables import Record, Row, rows_of
 
 from compgs.cli.main import parse as parse_compgs
@@ -135,21 +143,9 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "results")
-    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "leave_one_out")
     parser.add_argument("--lmbda", type=float, required=True)
     parser.add_argument("--only", nargs="+", metavar="RULE", help="leave out some of the rules alone")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--steps", type=int, help="default: the preset's")
-    parser.add_argument("--preset")
-    parser.add_argument("-r", "--downscale", type=int, default=1)
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--lpips", action="store_true")
-    parser.add_argument("--flip", action="store_true")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="of all variants"
-    )
+    add_training_options(parser, ROOT / "runs" / "leave_one_out")
     return parser.parse_args(arguments)
 
 
@@ -165,16 +161,18 @@ def main(arguments: Sequence[str] | None = None, run: Callable[[list[str]], None
         chosen = [v for v in chosen if v.curve == WHOLE or v.name.removeprefix("without_") in options.only]
     name = f"{scene.name}_{options.lmbda:g}"
 
+    def folder(variant: Variant, seed: int) -> Path:
+        return options.runs / name / f"{variant.name}_seed{seed}"
+
     def command(variant: Variant, seed: int) -> list[str]:
-        return train_command(variant, scene, options.runs / name / f"{variant.name}_seed{seed}", common, seed)
+        return train_command(variant, scene, folder(variant, seed), common, seed)
 
     chosen = acting(chosen, plans_of([command(variant, options.seeds[0]) for variant in chosen]))
     records = []
     for seed in options.seeds:
         for variant in chosen:
             print(f"== {variant.label}, seed {seed}", flush=True)
-            folder = options.runs / name / f"{variant.name}_seed{seed}"
-            records.append(run_variant(variant, command(variant, seed), folder, seed, run))
+            records.append(run_variant(variant, command(variant, seed), folder(variant, seed), seed, run))
     given = sys.argv[1:] if arguments is None else arguments
     text = report(scene.name, records, f"python benchmarks/leave_one_out.py {' '.join(map(str, given))}")
     stem = options.output / f"leave_one_out_{name}"
