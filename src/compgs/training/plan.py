@@ -28,7 +28,7 @@ USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 # within a factor of 2 (one standard deviation), at worst 3.5.
 ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 1.5
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
-# two bits of an anchor there, which has a hundred and more.
+# two bits of an anchor there, which has a hundred and more. More hidden units do not pay even there.
 MANY_ANCHORS = 20_000
 # Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
 # up for an error.
@@ -184,14 +184,6 @@ RULES: tuple[Rule, ...] = (
         "45 passes and more, fewer than 20,000 anchors, lambda up to 1e-5",
         lambda s: not s.large and s.often(45) and s.lmbda <= 1e-5,
         "results/decisions.md",
-    ),
-    # What all anchors share is too narrow for many: 0.2 dB and .005 of SSIM on Truck in a tenth fewer bytes, after
-    # 8 000 steps beside 10 000. Fewer units than 32 were asked for.
-    Rule(
-        "wide_heads", "width", lambda c, s, width: 2 * width if width >= 32 else width,
-        "20,000 anchors and more: twice, from 32 hidden units on",
-        lambda s: s.large,
-        "results/truck.md",
     ),
     # Fox with lambda 0.001 (a price of 1.2e-7) is better with 32, plush (1.6e-7) with 16.
     Rule(
