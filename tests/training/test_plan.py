@@ -30,11 +30,13 @@ from compgs.training.start import plan_for, start_of
 
 DOCS = Path(__file__).parents[2] / "docs"
 LAMBDAS = [0.0, *(10 ** (n / 8) for n in range(-64, 9))]
-USUAL = Start(5000, 80, 20.0, 30.0, 0.002, 86_400, "cpu")
+USUAL = Start(5000, 80, 60.0, 30.0, 0.002, 86_400, "cpu")
 STARTS = [
-    replace(USUAL, anchors=anchors, views=views, passes=passes, lmbda=lmbda, pixels=pixels, device=device)
+    replace(
+        USUAL, anchors=anchors, sightings=sightings, passes=passes, lmbda=lmbda, pixels=pixels, device=device
+    )
     for anchors in (300, 5000, 500_000)
-    for views in (8, 22, 23, 300)
+    for sightings in (5.0, 16.0, 17.0, 150.0)
     for passes in (10.0, 44.9, 45.0)
     for lmbda in LAMBDAS[::6]
     for pixels, device in ((86_400, "cpu"), (1_000_000, "cuda"))
@@ -79,10 +81,10 @@ def test_a_model_never_becomes_smaller_when_bits_become_cheaper() -> None:
 
 
 @pytest.mark.parametrize("anchors", [200, 2_000, 6_000, 50_000, 1_000_000])
-@pytest.mark.parametrize(("views", "passes"), [(12, 100.0), (80, 100.0), (80, 20.0)])
-def test_a_larger_size_never_gives_a_smaller_model(anchors: int, views: int, passes: float) -> None:
+@pytest.mark.parametrize(("sightings", "passes"), [(9.0, 100.0), (60.0, 100.0), (60.0, 20.0)])
+def test_a_larger_size_never_gives_a_smaller_model(anchors: int, sightings: float, passes: float) -> None:
     sizes = sorted({int(1000 * 1.05**n) + extra for n in range(280) for extra in (0, 1)})
-    start = replace(USUAL, anchors=anchors, views=views, passes=passes)
+    start = replace(USUAL, anchors=anchors, sightings=sightings, passes=passes)
     found = [
         plan(asked(target_bytes=size), replace(start, lmbda=lambda_for(size / anchors))) for size in sizes
     ]
@@ -104,33 +106,33 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
 @pytest.mark.parametrize(
     ("start", "field", "value"),
     [
-        ({"views": 22, "lmbda": 1e-4}, "coupled_primitives", 10),
-        ({"views": 23, "lmbda": 1e-4}, "coupled_primitives", 5),
+        ({"sightings": 16.0, "lmbda": 1e-4}, "coupled_primitives", 10),
+        ({"sightings": 17.0, "lmbda": 1e-4}, "coupled_primitives", 5),
         ({"anchors": 20_000}, "coupled_primitives", 3),
         ({"anchors": 20_000}, "voxel_spacings", 0.7),
         ({"anchors": 20_000}, "dense_points", 8.0),
-        ({"anchors": 20_000, "views": 22}, "dense_points", 0.0),
+        ({"anchors": 20_000, "sightings": 16.0}, "dense_points", 0.0),
         ({"anchors": 20_000, "points_at_hand": True}, "voxel_spacings", 1.5),
         ({"anchors": 20_000, "points_at_hand": True}, "coupled_primitives", 5),
         ({"anchors": 20_000, "points_at_hand": True}, "dense_points", 0.0),
         ({"anchors": 19_999}, "coupled_primitives", 5),
-        ({"views": 12, "lmbda": 1e-3}, "residuals", True),
-        ({"views": 12, "lmbda": 2e-3}, "residuals", False),
-        ({"views": 100, "lmbda": 1e-5, "passes": 45.0}, "residuals", True),
-        ({"views": 100, "lmbda": 1e-5, "passes": 44.99}, "residuals", False),
-        ({"views": 12, "lmbda": 1e-5, "passes": 45.0}, "heads", "separate"),
-        ({"views": 12, "lmbda": 2e-5, "passes": 45.0}, "heads", "paired"),
+        ({"sightings": 9.0, "lmbda": 1e-3}, "residuals", True),
+        ({"sightings": 9.0, "lmbda": 2e-3}, "residuals", False),
+        ({"lmbda": 1e-5, "passes": 45.0}, "residuals", True),
+        ({"lmbda": 1e-5, "passes": 44.99}, "residuals", False),
+        ({"sightings": 9.0, "lmbda": 1e-5, "passes": 45.0}, "heads", "separate"),
+        ({"sightings": 9.0, "lmbda": 2e-5, "passes": 45.0}, "heads", "paired"),
         ({"lmbda": 0.001, "anchors": 8_300}, "width", 32),
         ({"lmbda": 0.001, "anchors": 6_250}, "width", 16),
         ({"lmbda": 0.01, "anchors": 6_000}, "width", 8),
         ({"lmbda": 0.003, "anchors": 6_000}, "reference_context", "neighbours"),
         ({"lmbda": 0.005, "anchors": 6_000}, "reference_context", "none"),
-        ({"views": 23, "lmbda": 0.002}, "dilation", 0.02),
-        ({"views": 22, "lmbda": 0.002}, "dilation", 0.3),
-        ({"views": 30, "lmbda": 0.0021}, "dilation", 0.3),
-        ({"views": 15}, "dropout", 0.2),
-        ({"views": 30}, "dropout", 0.0),
-        ({"views": 15}, "bit_discount", 0.5),
+        ({"sightings": 17.0, "lmbda": 0.002}, "dilation", 0.02),
+        ({"sightings": 16.0, "lmbda": 0.002}, "dilation", 0.3),
+        ({"lmbda": 0.0021}, "dilation", 0.3),
+        ({"sightings": 11.0}, "dropout", 0.2),
+        ({"sightings": 22.0}, "dropout", 0.0),
+        ({"sightings": 11.0}, "bit_discount", 0.5),
         ({"device": "cuda"}, "sampled_gradients", 0.0),
         ({"processes": 2}, "passed_over", 0.0),
         ({"pixels": 160_000}, "coarse_until", 0.7),
@@ -144,6 +146,12 @@ def test_the_default_decides(start: dict[str, float], field: str, value: object)
     """Once a rule has gone, its lines go."""
     found = getattr(plan(Config(), replace(USUAL, **start)), field)  # type: ignore[arg-type]
     assert found == (pytest.approx(value) if isinstance(value, float) else value)
+
+
+def test_photographs_of_other_places_do_not_make_few_views_many() -> None:
+    few = plan(Config(), replace(USUAL, views=15, sightings=5.0))
+    more = plan(Config(), replace(USUAL, views=300, sightings=5.0))
+    assert few.dropout == more.dropout > 0 and few.dilation == more.dilation
 
 
 def test_the_paper_preset_applies_no_rule() -> None:
