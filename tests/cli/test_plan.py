@@ -8,6 +8,7 @@ import pytest
 from compgs.cli.main import main
 from compgs.scene.generated import generate_scene
 from compgs.training import Plan, load_run
+from compgs.words import duration
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +48,38 @@ def test_a_training_ends_with_four_lines_and_two_commands(
         ["next:", "compgs", "view", "run/run.cgs"],
         ["next:", "compgs", "export", "run/run.cgs", "run.html"],
     ]
+
+
+def test_a_time_becomes_the_steps_that_fit_into_it(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("compgs.compressing.pace.seconds_per_step", lambda *_: 4.0)
+    monkeypatch.setattr("compgs.compressing.pace.FEWEST", 3)
+    run = tmp_path / "run"
+    options = ["--time", "30s", "--device", "cpu", "--set", "model.max_anchors=60"]
+    assert main(["train", str(scene), "-o", str(run), *options]) == 0
+    kept = json.loads((run / "config.json").read_text())
+    steps = kept["settings"]["training"]["steps"]
+    assert steps in (6, 7), "30 s, less what the plan took, at 4 s a step"
+    assert f"steps: {steps} fit into {duration(30)}" in capsys.readouterr().out
+    assert kept["plan"]["start"]["passes"] == steps / 7
+    assert json.loads((run / "training.json").read_text())["steps"] == steps
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--time", "1h", "--steps", "9"], "--time chooses the steps"),
+        (["--time", "soon"], "--time soon: expected a time"),
+        (["--time", "1h", "--resume"], "continues with the steps the run began with"),
+        (["--time", "1h", "--method", "3dgs"], "give --steps"),
+    ],
+)
+def test_a_time_that_cannot_be_kept_is_refused(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert main(["train", str(scene), "-o", str(tmp_path / "run"), *options]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_a_plan_alone_trains_nothing(

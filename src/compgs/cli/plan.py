@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from compgs.cli.console import say
+from compgs.cli.console import say, warn
 from compgs.cli.run_folder import SETTINGS_NAME, RunSettings
 from compgs.errors import CheckpointError
 from compgs.words import duration, size
@@ -26,6 +26,18 @@ def planned(settings: RunSettings, scene: "Scene", device: str | None, tiles: in
         tiles = tiles_of(settings.tiles, scene)
     plan = plan_for(scene, settings.config, chosen_device(device), tiles)
     return replace(settings, plan=plan.to_dict())
+
+
+def with_time(settings: RunSettings, scene: "Scene", seconds: float, device: str | None) -> RunSettings:
+    """The settings with as many steps as a training of about `seconds` takes: some are tried, and thrown away."""
+    from compgs.compressing.pace import steps_within
+
+    fitting = steps_within(scene, settings.config, seconds, device)
+    say(f"steps: {fitting.steps:,} fit into {duration(seconds)} at the pace of the first ones")
+    if fitting.late:
+        warn(f"the fewest that show anything take {duration(fitting.late)} longer than that")
+    config = settings.config
+    return replace(settings, config=replace(config, training=replace(config.training, steps=fitting.steps)))
 
 
 def tiles_of(grid: str, scene: "Scene") -> int:

@@ -10,9 +10,11 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from compgs.cli.command import NO_DEFAULT
 from compgs.cli.console import say
+from compgs.cli.plan import PLANNED, with_time
+from compgs.cli.ranks import several
 from compgs.cli.run_folder import RunSettings
 from compgs.cli.settings import check_settings_of, with_settings
-from compgs.cli.sizes import parse_size
+from compgs.cli.sizes import parse_size, parse_time
 from compgs.cli.training_command import TrainingCommand
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.cli.viewing import check_viewing, viewing
@@ -38,6 +40,8 @@ class Train(TrainingCommand):
     compgs train scenes/garden -o runs/garden
 
     compgs train scenes/garden --plan
+
+    compgs train scenes/garden -o runs/hour --time 1h
 
     compgs train scenes/garden -o runs/quick --preset quick -r 4
 
@@ -73,6 +77,10 @@ class Train(TrainingCommand):
     """Size of the file: 130kB, 2MB, 1.5MiB or plain bytes. The weight of the rate is then found while training, and
     --lmbda is where it begins."""
 
+    time: Annotated[str | None, arg(metavar="TIME", help_behavior_hint=NO_DEFAULT)] = None
+    """How long the training may take, about: 5min, 1h, 1h30min. The steps are chosen for it before the training begins;
+    as the machine's speed decides, --seed alone no longer gives the same file."""
+
     profile: FlagCreatePairsOff[bool] = False
     """Print where a step's time goes; training.json has it too."""
 
@@ -106,9 +114,27 @@ class Train(TrainingCommand):
             say(f"the scene as it grows: {view.address}")
             yield view
 
+    def timed(self, settings: RunSettings, scene: "Scene") -> RunSettings:
+        if self.time is None:
+            return settings
+        return with_time(settings, scene, parse_time(self.time, "--time"), self.device)
+
+    def check_time(self, method: str) -> None:
+        """Raises UsageError where no time can be given."""
+        if self.time is None:
+            return
+        parse_time(self.time, "--time")
+        if self.steps is not None:
+            raise UsageError("--time chooses the steps, and --steps gives them; give one of them")
+        if method != PLANNED:
+            raise UsageError(f"--time: nothing is known of the pace of --method {method}; give --steps")
+        if several():
+            raise UsageError("--time: the pace of several processes is not known; give --steps")
+
     def settings_of_new(self) -> RunSettings:
         """Return the command line's settings. Raises UsageError."""
         preset, method = self.preset or "default", self.method or "compgs"
+        self.check_time(method)
         source = self.scene_source(holdout=self.eval)
         if method not in METHODS:
             raise UsageError(f"--method {method}: expected one of {', '.join(METHODS)}")
@@ -124,6 +150,8 @@ class Train(TrainingCommand):
         """Return the settings of a run to continue, which must be those that are given. Raises UsageError,
         CheckpointError.
         """
+        if self.time is not None:
+            raise UsageError("--time: --resume continues with the steps the run began with; leave it out")
         begun = super().settings_of_begun(folder)
         if begun.tiles is not None:
             raise UsageError(

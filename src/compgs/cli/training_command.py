@@ -149,7 +149,7 @@ class TrainingCommand(ComputingCommand, SceneOptions):
             if self.resume:
                 say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
             scene, settings = self.read(settings)
-            settings = planned(settings, scene, self.device)
+            settings = planned(self.timed(settings, scene), scene, self.device)
             if leads and settings.plan is not None:
                 say_lines(settings.plan)
             if leads and settings.tile is None:
@@ -190,7 +190,7 @@ class TrainingCommand(ComputingCommand, SceneOptions):
             )
         self.prepare_training("train")
         scene, settings = self.read(settings)
-        settings = planned(settings, scene, self.device)
+        settings = planned(self.timed(settings, scene), scene, self.device)
         plan = plan_in(settings)
         assert plan is not None and settings.plan is not None
         say_lines(settings.plan)
@@ -232,6 +232,10 @@ class TrainingCommand(ComputingCommand, SceneOptions):
             if found is None:
                 raise
         return read_scene(found, at_once=settings.tiles is None), replace(settings, scene=found)
+
+    def timed(self, settings: RunSettings, scene: "Scene") -> RunSettings:
+        """The settings with the steps that the run has time for, if it was given a time."""
+        return settings
 
     def continues(self, folder: Path) -> bool:
         """There is a checkpoint to go on from, and it is asked for."""

@@ -225,7 +225,7 @@ def begin(
     deadline = None
     if seconds is not None:
         end = start + seconds * (1 - FOR_THE_REST)
-        fitting = steps_within(scene, config, end - time.monotonic(), device)
+        fitting = steps_within(scene, config, end - time.monotonic(), device, points_at_hand=True)
         config = replace(config, training=replace(config.training, steps=fitting.steps))
         deadline = Deadline(end, fitting.steps, late=fitting.late)
     begun = Begun(source, digest(splats), looking, placed, config)

@@ -32,10 +32,12 @@ class Fitting:
     late: float = 0.0  # seconds after the time, in which the fewest steps end where they do not fit
 
 
-def steps_within(scene: Scene, config: Config, seconds: float, device: str | None) -> Fitting:
-    """Steps of a training that ends about `seconds` from now."""
+def steps_within(
+    scene: Scene, config: Config, seconds: float, device: str | None, *, points_at_hand: bool = False
+) -> Fitting:
+    """Steps of a training that ends about `seconds` from now. `points_at_hand`: none are looked for before it."""
     start = time.perf_counter()
-    plan = plan_for(scene, config, chosen_device(device), points_at_hand=True)
+    plan = plan_for(scene, config, chosen_device(device), points_at_hand=points_at_hand)
     pace = WHOLE_RUN * seconds_per_step(scene, config, device, plan, seconds)
     left = seconds - (time.perf_counter() - start)
     steps = max(FEWEST, int(left / pace))
