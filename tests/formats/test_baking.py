@@ -106,7 +106,7 @@ def test_opacity_is_the_mean_over_what_reaches_the_primitive_where_it_is_not_dra
 class TwoBalls:
     """Balls at the origin and a unit before it, one anchor each; look(camera) gives opacities [2] and colors [2, 3]."""
 
-    coupled = 2
+    coupled = anchors = 2
     background = world_offset = (0.0, 0.0, 0.0)
     angular_dilation = None
     antialiased = False
@@ -145,6 +145,35 @@ def test_a_primitive_that_is_not_drawn_hides_next_to_nothing_of_those_behind_it(
     assert sigmoid(baked.splats.opacity_logits).item() == pytest.approx(0.4, abs=0.01)
 
 
+class BallAside(TwoBalls):
+    """The second ball is far to the side, where `along_z` does not look."""
+
+    geometry = np.array([[0.0, 0, 0], [90, 0, 0]], np.float32), *TwoBalls.geometry[1:]
+    bounds = geometry[0], np.ones(2, np.float32)
+
+
+def test_what_lies_outside_of_all_pictures_is_as_the_networks_say_from_their_cameras() -> None:
+    front, behind = along_z(-4.0), along_z(4.0)
+
+    def look(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        from_front = camera.center[2] < 0
+        aside = 0.2 if from_front else 0.6
+        colors = np.array([[0.5] * 3, [0.3, 0.8, 0.1] if from_front else [0.5, 0.6, 0.1]], np.float32)
+        return np.array([0.7, aside], np.float32), colors
+
+    baked = bake(BallAside(look), [front, behind], degree=0)  # type: ignore[arg-type]
+    np.testing.assert_allclose(sigmoid(baked.splats.opacity_logits), [0.7, 0.4], atol=1e-4)
+    np.testing.assert_allclose(0.5 + 0.28209479 * baked.splats.dc[1], [0.4, 0.7, 0.1], atol=1e-4)
+    assert baked.importance[0] > 1 and baked.importance[1] == 0
+
+
+def test_what_is_not_there_from_any_camera_is_dropped_outside_of_their_pictures_too() -> None:
+    def look(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([0.7, 0.0], np.float32), np.zeros((2, 3), np.float32)
+
+    assert len(bake(BallAside(look), [along_z(-4.0)], degree=0).splats) == 1  # type: ignore[arg-type]
+
+
 def test_a_camera_counts_by_the_pixels_that_it_sees_of_a_primitive() -> None:
     near, far = along_z(2.0), along_z(8.0)
 
@@ -181,8 +210,9 @@ def test_geometry_is_that_of_the_scene(model: HybridModel, cameras: list[Camera]
     np.testing.assert_allclose(np.exp(baked.splats.log_scales), scales[rows], rtol=1e-5)
 
 
-def test_what_no_camera_sees_is_dropped(model: HybridModel, cameras: list[Camera]) -> None:
-    assert 0 < len(bake(model, cameras, 0).splats) <= model.coupled
+def test_a_scene_of_which_no_camera_sees_anything_is_refused(
+    model: HybridModel, cameras: list[Camera]
+) -> None:
     away = cameras[0].moved(-1e3 * np.ones(3))
     with pytest.raises(TrainingError, match=rf"none of {model.coupled} primitives is seen from 1 cameras"):
         bake(model, [away], 0)

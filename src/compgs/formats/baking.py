@@ -8,6 +8,9 @@ squares in pixels:
 
 v runs over the cameras; w_v is the primitive's share of the image (transmittance x alpha, summed over pixels), and
 t_v = w_v / opacity_v what of it the primitives before it let through.
+
+A few cameras do not see everything that a visitor may see. A primitive that they do not see is as the networks say that
+it is from where they stand, all of them alike.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,6 +33,9 @@ from compgs.render import RasterSettings, blend_of, contributions, local_camera,
 PROBE_OPACITY = 0.008
 # Pixels by which a view counts in which a primitive is hidden: its color there is better known than guessed.
 HIDDEN_WEIGHT = 0.1
+# Pixels over all cameras, at full transmittance, below which a primitive counts as not seen: what is in no picture of
+# the cameras may be the sky of another one.
+LEAST_SEEN = 0.5
 # Of the squared coefficients of degree l, times l^2 and the views' weight. A hundred times more costs 1 dB.
 PENALTY = 1e-4
 MAX_OPACITY = 0.999  # the rasterizer draws nothing more opaque
@@ -60,7 +66,7 @@ def bake(
     degree: int = 3,
     progress: Callable[[], None] | None = None,  # called after each camera
 ) -> Baked:
-    """Splats that look like the model from the cameras. Primitives that no camera sees are dropped.
+    """Splats that look like the model from the cameras. Primitives that are not drawn are dropped.
 
     The cameras should surround what they see and be many more than coefficients: of twelve, pictures between them lose
     2.5 dB against 96. Memory: 1.2 kB a primitive at degree 3. Raises TrainingError if there is nothing to be seen.
@@ -71,10 +77,13 @@ def bake(
         _add_view(sums, model, local_camera(model, camera), settings)
         if progress:
             progress()
+    if not sums.importance.any():
+        raise TrainingError(f"none of {model.coupled} primitives is seen from {len(cameras)} cameras")
+    unseen = sums.reaching < LEAST_SEEN
+    for camera in cameras if unseen.any() else ():
+        _add_unseen(sums, model, local_camera(model, camera), unseen)
     opacities = np.clip(sums.opacity / np.maximum(sums.reaching, np.float32(1e-12)), 0, MAX_OPACITY)
     kept = np.flatnonzero((sums.weight > 0) & (opacities > CUTOFF))
-    if not len(kept):
-        raise TrainingError(f"none of {model.coupled} primitives is seen from {len(cameras)} cameras")
     means, scales, quaternions = (array[kept] for array in model.geometry)
     blocks = np.split(kept, range(BLOCK, len(kept), BLOCK))
     harmonics = np.concatenate([_solved(sums, rows, degree) for rows in blocks])
@@ -115,13 +124,40 @@ def _add_view(sums: _Sums, model: HybridModel, camera: Camera, settings: RasterS
     """
     visible = visible_mask(*model.bounds, camera, settings)
     gaussians, drawn = model.drawn(camera, visible)
-    shown = gaussians.opacities > CUTOFF  # on a GPU those are there, too, that are not
-    gaussians = Gaussians(*(value[shown] for value in vars(gaussians).values()))
-    drawn = drawn[shown]
+    # On a GPU those are there, too, that are not drawn.
+    gaussians, drawn = _chosen(gaussians, drawn, gaussians.opacities > CUTOFF)
     _add_opacities(sums, model, camera, settings, visible, gaussians, drawn)
     share = contributions(gaussians, camera, settings, blend_of(model))
     sums.importance[drawn] += share
-    weight = share + np.float32(HIDDEN_WEIGHT)
+    _add_colors(sums, gaussians, drawn, share + np.float32(HIDDEN_WEIGHT), camera)
+
+
+def _add_unseen(sums: _Sums, model: HybridModel, camera: Camera, unseen: np.ndarray) -> None:
+    """Add what the networks say of the primitives of a mask [P] bool, as if the camera saw a little of each."""
+    anchors = np.zeros(model.anchors, bool)
+    anchors[model.primitives.anchor_index[unseen]] = True
+    gaussians, drawn = model.drawn(camera, anchors)
+    gaussians, drawn = _chosen(gaussians, drawn, unseen[drawn] & (gaussians.opacities > CUTOFF))
+    sums.reaching[unseen] += np.float32(LEAST_SEEN)
+    sums.opacity[drawn] += np.float32(LEAST_SEEN) * gaussians.opacities
+    _add_colors(sums, gaussians, drawn, np.full(len(drawn), HIDDEN_WEIGHT, np.float32), camera)
+
+
+def _chosen(
+    gaussians: Gaussians[np.ndarray], drawn: np.ndarray, which: np.ndarray
+) -> tuple[Gaussians[np.ndarray], np.ndarray]:
+    """Those of a mask [M] bool."""
+    return Gaussians(*(value[which] for value in vars(gaussians).values())), drawn[which]
+
+
+def _add_colors(
+    sums: _Sums,
+    gaussians: Gaussians[np.ndarray],
+    drawn: np.ndarray,  # [M] int64, which primitives they are
+    weight: np.ndarray,  # [M] pixels
+    camera: Camera,
+) -> None:
+    """Add the colors that a camera sees."""
     offsets = gaussians.means - camera.center.astype(np.float32)
     directions = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), np.float32(1e-12))
     degree = degree_of(sums.normal.shape[1] - 1)
