@@ -66,6 +66,8 @@ class Exported:
     origin: tuple[float, float, float]  # world units: where positions in the file count from
     viewing_psnr: tuple[float, ...] = ()  # dB, at VIEWING_SIDE, where the photographs are smaller than that
     softer: bool = False  # whether other programs draw the splats softer than the scene is
+    # Steps in which splats that were made anew were fitted to the scene's pictures; None: none were made anew.
+    refined: int | None = None
 
     @property
     def mean(self) -> float:
@@ -176,7 +178,15 @@ def export(
     # Others add the same number of pixels to pictures of every size.
     sharp = settings_of(model).dilation_of(cameras[0]) < SOFTER * DEFAULT_SETTINGS.dilation
     return Exported(
-        len(data), again.counts["splats"], baked.splats.degree, dropped, psnr, origin, viewing_psnr, sharp
+        len(data),
+        again.counts["splats"],
+        baked.splats.degree,
+        dropped,
+        psnr,
+        origin,
+        viewing_psnr,
+        sharp,
+        refine if changed else None,
     )
 
 

@@ -127,6 +127,18 @@ def test_a_report_says_that_other_programs_draw_a_sharp_scene_softer() -> None:
     )
 
 
+def test_a_report_says_that_fitting_was_left_out_where_there_was_something_to_fit(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, tiny_cgs: Path
+) -> None:
+    out, again = tmp_path / "a.ply", tmp_path / "b.ply"
+    _, said, _ = outcome(capsys, "export", tiny_cgs, out, "--degree", 0, "--refine", 0)
+    assert "note: the splats were not fitted to the scene's pictures; --refine 100" in said
+    _, said, _ = outcome(capsys, "export", out, again, "--refine", 0)
+    assert "not fitted" not in said
+    _, said, _ = outcome(capsys, "export", tiny_cgs, out, "--degree", 0, "--refine", 1, "--overwrite")
+    assert "not fitted" not in said
+
+
 def test_a_lower_degree_is_not_advised_where_there_is_none() -> None:
     done = Exported(100, 20, 0, 30, (40.0,), ORIGIN)
     assert report(Path("a.cgs"), Path("b.ply"), done)[-1] == "30 of 50 splats were left out"

@@ -119,6 +119,11 @@ def report(source: Path, path: Path, exported: "Exported") -> list[str]:
         lines.append(
             f"note: positions count from {place}: {path.suffix} has no place for that; .ply and .glb do"
         )
+    if exported.refined == 0:
+        lines.append(
+            "note: the splats were not fitted to the scene's pictures; --refine 100, the default, brings them nearer: "
+            "most where opacities depend on the direction of view, as in captures with windows and a far background"
+        )
     if exported.softer:
         lines.append(
             f"note: other programs draw splats softer than {source.name} is, in pictures as small as its photographs: "
