@@ -1,5 +1,6 @@
 # make demo   a scene is made, trained, encoded, and its file decoded and judged in a new process: 1 1/2 minutes on two idle cores
-# make test   the test suite
+# make test   the tests of everyday work: about five minutes on two idle cores
+# make test-all   all tests; those that take long and guard what a change rarely breaks, too
 # make lint   style and types
 # make bounds the installation without extras, at the lowest versions that pyproject.toml allows, in a folder of its own
 # make docs   the documentation as a site, in build/site
@@ -14,7 +15,7 @@ INSTALLED := $(VENV)/.installed
 # Idle OpenMP threads sleep instead of taking the cores from numba's.
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: help demo test lint bounds docs web venv
+.PHONY: help demo test test-all lint bounds docs web venv
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -43,8 +44,13 @@ demo: venv
 	@echo "== the same file in a web page, to open from disk"
 	@$(BIN)/compgs export demo.cgs demo.html --overwrite
 
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile --durations=5
+
 test: venv
-	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile --durations=5
+	@$(PYTEST) -m 'not slow'
+
+test-all: venv
+	@$(PYTEST)
 
 lint: venv
 	@$(BIN)/ruff check

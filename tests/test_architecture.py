@@ -1,12 +1,11 @@
 """The house's rules: who may import whom, and what decoding must not load."""
 
 import ast
+import functools
 import os
 import subprocess
 import sys
 from pathlib import Path
-
-import pytest
 
 import compgs
 
@@ -118,6 +117,11 @@ ALLOWED = {
 }
 
 
+@functools.cache
+def parsed(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
 def part_of(module: str) -> str:
     """`compgs.scene.colmap` belongs to `scene`; `compgs` is the package's own __init__."""
     names = module.split(".")
@@ -127,7 +131,7 @@ def part_of(module: str) -> str:
 def imported_parts(file: Path) -> set[str]:
     """Parts of the package that a source file imports, anywhere in it."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(file)):
         if isinstance(node, ast.Import):
             found |= {part_of(alias.name) for alias in node.names if alias.name.split(".")[0] == "compgs"}
         elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "compgs":
@@ -139,12 +143,12 @@ def imported_parts(file: Path) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("file", sorted(SOURCE.rglob("*.py")), ids=lambda f: str(f.relative_to(SOURCE)))
-def test_imports_point_one_way(file: Path) -> None:
-    relative = file.relative_to(SOURCE).with_suffix("").parts
-    part = "compgs" if relative == ("__init__",) else relative[0]
-    assert part in ALLOWED, f"{part} is new: say in this test what it may import"
-    assert imported_parts(file) <= ALLOWED[part] | {part}
+def test_imports_point_one_way() -> None:
+    for file in SOURCE.rglob("*.py"):
+        relative = file.relative_to(SOURCE).with_suffix("").parts
+        part = "compgs" if relative == ("__init__",) else relative[0]
+        assert part in ALLOWED, f"{part} is new: say in this test what it may import"
+        assert imported_parts(file) <= ALLOWED[part] | {part}, file
 
 
 def module_imports() -> dict[str, set[str]]:
@@ -158,7 +162,7 @@ def module_imports() -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for module, file in files.items():
         found[module] = set()
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(file)):
             named = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.module:
                 inner = [f"{node.module}.{alias.name}" for alias in node.names]
@@ -212,7 +216,7 @@ LOADS = {
 
 def loads_heavy(file: Path, *, at_import: bool) -> bool:
     """Whether a source file imports one of HEAVY: anywhere in it, or as soon as it is itself imported."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
+    tree = parsed(file)
     typing_only = {
         id(node)
         for guard in ast.walk(tree)
@@ -251,92 +255,81 @@ def test_only_the_command_line_prints() -> None:
         str(file.relative_to(SOURCE))
         for file in SOURCE.rglob("*.py")
         if file.relative_to(SOURCE).parts[0] != "cli"
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        for node in ast.walk(parsed(file))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
     ]
     assert printing == []
 
 
-def modules_after(statement: str) -> set[str]:
-    """Names of the modules loaded in a fresh interpreter after a statement."""
-    program = f"import sys; {statement}; print('\\n'.join(sys.modules))"
+def loaded_after_each(*statements: str) -> list[set[str]]:
+    """Names of the modules that one fresh interpreter has loaded after each of some statements, run in this order."""
+    program = "import sys\n" + "".join(f"{statement}\nprint(*sys.modules)\n" for statement in statements)
     environment = {k: v for k, v in os.environ.items() if not k.startswith("COV")}
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True
     )
-    return set(done.stdout.split())
+    return [set(line.split()) for line in done.stdout.splitlines()]
 
 
-def test_importing_the_package_loads_neither_torch_nor_numba() -> None:
-    loaded = modules_after("import compgs")
-    assert "compgs" in loaded
-    assert not loaded & {"torch", "numba", "scipy", "PIL"}
-
-
-def test_formats_are_read_and_written_without_torch() -> None:
-    loaded = modules_after("import compgs.formats")
-    assert "compgs.formats.sog" in loaded
-    assert not loaded & {"torch", "numba", "scipy"}
-
-
-def test_methods_are_named_without_what_trains_them() -> None:
-    loaded = modules_after("import compgs.methods; compgs.methods.settings_of('3dgs')")
-    assert "compgs.methods.splats" in loaded
-    assert not loaded & {"torch", "numba", "scipy", "compgs.training"}
+def test_names_formats_and_the_command_line_start_without_torch_and_numba() -> None:
+    package, command_line, formats, methods = loaded_after_each(
+        "import compgs",
+        "import compgs.cli.main",
+        "import compgs.formats",
+        "import compgs.methods; compgs.methods.settings_of('3dgs')",
+    )
+    for loaded, expected in (
+        (package, "compgs"),
+        (command_line, "tyro"),
+        (formats, "compgs.formats.sog"),
+        (methods, "compgs.methods.splats"),
+    ):
+        assert expected in loaded
+        assert not loaded & {"torch", "numba", "scipy", "compgs.training"}
+    assert "PIL" not in command_line
 
 
 def test_what_opens_files_of_other_methods_loads_no_torch() -> None:
     folder = SOURCE / "published"
     files = [file for file in folder.rglob("*.py") if file.name != "__init__.py"]
     names = [".".join(file.relative_to(folder).with_suffix("").parts) for file in files]
-    loaded = modules_after("; ".join(f"import compgs.published.{name}" for name in names))
+    (loaded,) = loaded_after_each("; ".join(f"import compgs.published.{name}" for name in names))
     assert {"compgs.published.c3dgs", "compgs.published.cosa.reader"} <= loaded
     assert not loaded & {"torch", "compgs.training", "compgs.methods"}
 
 
-def test_the_command_line_starts_without_torch() -> None:
-    loaded = modules_after("import compgs.cli.main")
-    assert "tyro" in loaded
-    assert not loaded & {"torch", "numba", "scipy", "PIL"}
+CODING = (
+    "rans", "tables", "integer_network", "octree", "mask_coder", "weights", "reader", "viewpoints",
+    "viewpoint_cameras",
+)  # fmt: skip
 
 
-def test_decoding_never_loads_scenes_losses_or_training() -> None:
-    loaded = modules_after("import compgs.codec.decoder")
-    assert "compgs.codec.decoder" in loaded
+def test_from_bytes_to_a_scene_neither_torch_nor_scenes_losses_or_training_are_loaded() -> None:
+    modules = [f"compgs.codec.{module}" for module in (*CODING, "decoder")]
     forbidden = {"scene", "losses", "metrics", "training", "evaluation", "cli", "trained_model"}
-    assert not {m for m in loaded if m.startswith("compgs.") and part_of(m) in forbidden}
-    assert "compgs.numerics.ssim" not in loaded
+    for module, loaded in zip(
+        modules, loaded_after_each(*(f"import {module}" for module in modules)), strict=True
+    ):
+        assert module in loaded
+        assert not loaded & {"torch", "compgs.numerics.ssim"}, module
+        assert not {m for m in loaded if m.startswith("compgs.") and part_of(m) in forbidden}, module
 
 
-@pytest.mark.parametrize(
-    "module",
-    [
-        "rans",
-        "tables",
-        "integer_network",
-        "octree",
-        "mask_coder",
-        "weights",
-        "reader",
-        "viewpoints",
-        "viewpoint_cameras",
-    ],
-)
-def test_from_bytes_to_symbols_no_torch_is_loaded(module: str) -> None:
-    loaded = modules_after(f"import compgs.codec.{module}")
-    assert f"compgs.codec.{module}" in loaded
-    assert "torch" not in loaded
-
-
-@pytest.mark.parametrize(
-    "package", ["model", "render", "formats", "evaluation", "exporting", "viewer", "metrics"]
-)
-def test_looking_at_scenes_loads_no_torch(package: str) -> None:
-    folder = SOURCE / package
-    modules = [f"compgs.{package}", *(f"compgs.{package}.{file.stem}" for file in folder.glob("[a-z]*.py"))]
-    loaded = modules_after("; ".join(f"import {module}" for module in modules))
-    assert set(modules) <= loaded
-    assert not loaded & (HEAVY - {"scipy"})  # numba asks for scipy's version wherever it is installed
+def test_looking_at_scenes_loads_no_torch() -> None:
+    packages = ("model", "render", "formats", "evaluation", "exporting", "viewer", "metrics")
+    modules = [
+        [
+            f"compgs.{package}",
+            *(f"compgs.{package}.{file.stem}" for file in (SOURCE / package).glob("[a-z]*.py")),
+        ]
+        for package in packages
+    ]
+    for names, loaded in zip(
+        modules, loaded_after_each(*("import " + ", ".join(names) for names in modules)), strict=True
+    ):
+        assert set(names) <= loaded
+        # numba asks for scipy's version wherever it is installed
+        assert not loaded & (HEAVY - {"scipy"}), names[0]
 
 
 def test_public_names_exist() -> None:
@@ -347,5 +340,5 @@ def test_public_names_exist() -> None:
 def test_public_functions_stay_functions_whatever_was_imported() -> None:
     parts = sorted(p.name for p in SOURCE.iterdir() if (p / "__init__.py").is_file())
     names = [name for name in compgs.__all__ if name[0].islower()]
-    loaded = "; ".join(f"import compgs.{part}" for part in parts)
-    modules_after(f"{loaded}; assert all(callable(getattr(compgs, name)) for name in {names})")
+    everything = ", ".join(f"compgs.{part}" for part in parts)
+    loaded_after_each(f"import {everything}; assert all(callable(getattr(compgs, name)) for name in {names})")

@@ -1,11 +1,14 @@
 """A folder of scenes is converted, and a table says what that saved: as in the image and in the action."""
 
+import io
 import os
 import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -15,12 +18,25 @@ from compgs.model.splats import SplatArrays
 from compgs.opening import open_scene
 
 ROOT = Path(__file__).resolve().parent.parent
-TOOL = ROOT / "tools" / "convert_folder.py"
+sys.path.append(str(ROOT / "tools"))
+import convert_folder  # noqa: E402
 
 
-def convert(*arguments: object, **environment: str) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, str(TOOL), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
+@dataclass(frozen=True)
+class Done:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def convert(*arguments: object) -> Done:
+    """The tool in this process. (The action's step, below, runs it in one of its own.)"""
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        try:
+            code = convert_folder.main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return Done(code, out.getvalue(), err.getvalue())
 
 
 def rows(table: str) -> dict[str, list[str]]:

@@ -19,6 +19,7 @@ import compgs
 
 ROOT = Path(__file__).resolve().parent.parent
 GOLDEN = ROOT / "tests" / "golden"
+pytestmark = pytest.mark.slow
 pytest.importorskip("build", reason="needs the extra `dev`")
 
 
@@ -142,7 +143,6 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return programs
 
 
-@pytest.mark.slow
 def test_the_installed_package_does_what_somebody_does_who_has_received_a_file(
     installed: Path, tmp_path: Path
 ) -> None:

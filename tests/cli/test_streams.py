@@ -22,14 +22,31 @@ def by_the_shell(redirection: str, *arguments: object) -> subprocess.CompletedPr
     )
 
 
-@pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&-", ">&- 2>&- <&-"])
-@pytest.mark.parametrize("arguments", [["info", GOLDEN_FILE], ["--help"], ["info", "--help"], ["--version"]])
+CLOSED = (">&-", "2>&-", "<&-", ">&- 2>&- <&-")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "redirection"),
+    [
+        *((["--help"], redirection) for redirection in CLOSED),
+        (["info", GOLDEN_FILE], CLOSED[-1]),
+        *(
+            pytest.param(["info", GOLDEN_FILE], redirection, marks=pytest.mark.slow)
+            for redirection in CLOSED[:-1]
+        ),
+        *(
+            pytest.param(arguments, redirection, marks=pytest.mark.slow)
+            for arguments in (["info", "--help"], ["--version"])
+            for redirection in CLOSED
+        ),
+    ],
+)
 def test_a_closed_stream_is_no_error(redirection: str, arguments: list[object]) -> None:
     done = by_the_shell(redirection, *arguments)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&-"])
+@pytest.mark.parametrize("redirection", CLOSED[:3])
 def test_what_is_wrong_keeps_its_exit_code_where_a_stream_is_closed(redirection: str) -> None:
     done = by_the_shell(redirection, "info", "nowhere.cgs")
     assert done.returncode == 1

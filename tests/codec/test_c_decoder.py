@@ -63,6 +63,7 @@ def test_it_conforms(program: Path) -> None:
     assert done.returncode == 0 and "conforms" in done.stdout, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("compiler", "options"),
     [

@@ -1,6 +1,7 @@
 """Every `compgs` command that the documentation shows is run as it is written, on a scene of a few pixels.
 
-Only three things differ: runs are shortened to a few steps, tours to two frames, and servers end when they have begun.
+Only four things differ: runs and the fitting of baked splats are shortened to a few steps, tours to two frames, and
+servers end when they have begun.
 """
 
 import re
@@ -16,6 +17,7 @@ import pytest
 
 from compgs.cli.main import main
 from compgs.cli.training_command import TrainingCommand
+from compgs.formats.refining import refine
 from compgs.scene.generated import generate_scene
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -82,6 +84,11 @@ def shorten(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(TrainingCommand, "settings", settings)
     patch.setattr("compgs.suites.jobs._run", in_this_process)
+    patch.setattr("compgs.exporting.refine_splats", refined_shortly)
+
+
+def refined_shortly(baked: Any, model: Any, cameras: Any, steps: int, *others: Any, **named: Any) -> Any:
+    return refine(baked, model, cameras, min(STEPS, steps), *others, **named)
 
 
 def in_this_process(arguments: list[str], log: Path) -> int:

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import compgs
 
 PROGRAM = """
@@ -29,6 +31,7 @@ print(sum(blend_backward.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.slow
 def test_freshly_compiled_and_cached_kernels_train_the_same_models(
     scene_folder: Path, tmp_path: Path
 ) -> None:

@@ -1,5 +1,7 @@
 """The main job on a tiny scene: photographs in, one file out, views rendered from it by another process."""
 
+import contextlib
+import io
 import json
 import shutil
 import signal
@@ -23,8 +25,6 @@ from compgs.metrics import psnr, to_8bit
 from compgs.render import render
 from compgs.training import TrainingStatus
 
-pytestmark = pytest.mark.slow
-
 STEPS = 40
 CIRCLE = {"frames": 3, "width": 64, "height": 48}
 OPTIONS = ["--preset", "quick", "--steps", str(STEPS), "--seed", "7"]
@@ -38,6 +38,23 @@ def in_a_new_process(*arguments: object) -> str:
     return done.stdout
 
 
+def in_this_process(*arguments: object) -> str:
+    """The same without another process."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert main([str(argument) for argument in arguments]) == 0
+    return out.getvalue()
+
+
+Compgs = Callable[..., str]
+
+
+@pytest.fixture(params=[in_this_process, pytest.param(in_a_new_process, marks=pytest.mark.slow)])
+def command(request: pytest.FixtureRequest) -> Compgs:
+    """Standard output of `compgs` with some arguments."""
+    found: Compgs = request.param
+    return found
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory, scene_folder: Path) -> Path:
     """The folder of a finished run, named `tiny`."""
@@ -48,7 +65,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, scene_folder: Path) -> Path:
 
 def test_a_run_leaves_everything_it_promises(run: Path) -> None:
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
-    views = {f"test/{kind}/0000{i}.png" for kind in ("renders", "gt") for i in range(5)}
+    views = {f"test/{kind}/0000{i}.png" for kind in ("renders", "gt") for i in range(2)}
     expected = {"tiny.cgs", "results.json", "per_view.json", "config.json", "training.json", "cameras.json"}
     assert names >= expected | views | {"contact_sheet.png", "checkpoint.safetensors"}
     assert not [name for name in names if "partial" in name]
@@ -78,8 +95,8 @@ def test_held_out_views_are_recognizable_after_a_few_seconds(scene_folder: Path)
         assert psnr(to_8bit(render(model, view.camera).image), view.image) > psnr(flat, view.image) + 1
 
 
-def test_encoding_a_run_again_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
-    in_a_new_process("encode", run, "-o", tmp_path / "again.cgs")
+def test_encoding_a_run_again_gives_the_same_bytes(command: Compgs, run: Path, tmp_path: Path) -> None:
+    command("encode", run, "-o", tmp_path / "again.cgs")
     assert (tmp_path / "again.cgs").read_bytes() == (run / "tiny.cgs").read_bytes()
 
 
@@ -105,7 +122,7 @@ def test_a_run_and_its_file_become_the_same_smaller_file_and_the_loss_is_stated(
     )
     assert (tmp_path / "a.cgs").read_bytes() == by_training != by_held_out
     for out in (of_run, capsys.readouterr().out):
-        assert "the 35 training views" in out
+        assert "the 14 training views" in out
         assert "held-out photographs" in out and "new renderings against old ones" in out
     monkeypatch.setattr(camera_path, "surround", lambda positions: camera_path.orbit(positions, **CIRCLE))
     assert main(["encode", file, "-o", str(tmp_path / "c.cgs"), *smaller]) == 0
@@ -128,14 +145,14 @@ def test_symbols_do_not_depend_on_process_or_number_of_threads(run: Path, tmp_pa
             np.testing.assert_array_equal(one[name], every[name])
 
 
-def test_info_and_render_need_nothing_but_the_file(run: Path, tmp_path: Path) -> None:
+def test_info_and_render_need_nothing_but_the_file(command: Compgs, run: Path, tmp_path: Path) -> None:
     file = tmp_path / "alone.cgs"
     file.write_bytes((run / "tiny.cgs").read_bytes())
-    assert f"{file.stat().st_size:,} bytes" in in_a_new_process("info", file)
+    assert f"{file.stat().st_size:,} bytes" in command("info", file)
     circle = ["--frames", "3", "--width", "64", "--height", "48"]
     assert main(["render", str(file), *circle, "-o", str(tmp_path / "orbit")]) == 0
     assert len(list((tmp_path / "orbit").glob("*.png"))) == 3
-    in_a_new_process("render", file, "--cameras", run / "cameras.json", "-o", tmp_path / "views")
+    command("render", file, "--cameras", run / "cameras.json", "-o", tmp_path / "views")
     for image in (run / "test" / "renders").iterdir():
         assert image.read_bytes() == (tmp_path / "views" / image.name).read_bytes()
 
@@ -208,7 +225,11 @@ def test_a_run_that_was_stopped_continues_to_the_same_file(
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)], ids=["SIGTERM", "Ctrl-C"]
+    ("number", "code"),
+    [
+        pytest.param(signal.SIGINT, 130, id="Ctrl-C"),
+        pytest.param(signal.SIGTERM, 143, id="SIGTERM", marks=pytest.mark.slow),
+    ],
 )
 def test_a_process_that_is_asked_to_end_leaves_a_checkpoint_and_the_usual_code(
     scene_folder: Path, tmp_path: Path, number: signal.Signals, code: int

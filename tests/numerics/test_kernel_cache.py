@@ -59,6 +59,7 @@ def finish(process: subprocess.Popen[str]) -> tuple[int, int]:
     return int(value), int(hits)
 
 
+@pytest.mark.slow
 def test_an_edit_of_a_file_that_a_kernel_inlines_is_never_missed(package: Path, tmp_path: Path) -> None:
     assert finish(start(package, tmp_path)) == (2**48 - 1, 0)
     assert finish(start(package, tmp_path)) == (2**48 - 1, 1)
@@ -70,6 +71,7 @@ def test_an_edit_of_a_file_that_a_kernel_inlines_is_never_missed(package: Path, 
     assert finish(start(package, tmp_path)) == (2**48 - 1, 1), "both versions stay"
 
 
+@pytest.mark.slow
 def test_two_processes_may_compile_the_same_at_once(package: Path, tmp_path: Path) -> None:
     both = [start(package, tmp_path), start(package, tmp_path)]
     assert [finish(process)[0] for process in both] == [2**48 - 1, 2**48 - 1]
@@ -77,6 +79,7 @@ def test_two_processes_may_compile_the_same_at_once(package: Path, tmp_path: Pat
     assert not list(tmp_path.rglob("*.tmp"))
 
 
+@pytest.mark.slow
 def test_kernels_work_where_nothing_can_be_written(package: Path, tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()

@@ -76,6 +76,7 @@ def kill_one_worker(output: Path, killed: list[int]) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_costs_nothing_but_time_and_the_table_is_that_of_the_plain_loop(
     tiny: Suite, data: Path, tmp_path: Path
 ) -> None:

@@ -55,6 +55,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow
 def test_two_ranks_with_a_view_each_have_the_gradients_of_one_with_two_views(
     found: dict[str, Any], kind: str
 ) -> None:
@@ -67,6 +68,7 @@ def test_two_ranks_with_a_view_each_have_the_gradients_of_one_with_two_views(
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow
 def test_ranks_stay_identical_to_the_last_bit_and_near_the_run_of_one(
     found: dict[str, Any], kind: str
 ) -> None:
@@ -83,6 +85,7 @@ def test_ranks_stay_identical_to_the_last_bit_and_near_the_run_of_one(
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow
 def test_no_rank_reads_the_photographs_of_another(found: dict[str, Any], kind: str) -> None:
     first, second = (rank[f"run {kind}"]["seen"] for rank in found["together"])
     assert len(first) == len(second) == 4 and not first & second
@@ -90,6 +93,7 @@ def test_no_rank_reads_the_photographs_of_another(found: dict[str, Any], kind: s
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow
 def test_the_checkpoint_of_one_process_goes_on_with_two(found: dict[str, Any], kind: str) -> None:
     first, second = (rank[f"resumed {kind}"] for rank in found["together"])
     alone = found["alone"][0][f"resumed {kind}"]
@@ -104,6 +108,7 @@ def test_the_checkpoint_of_one_process_goes_on_with_two(found: dict[str, Any], k
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow
 def test_the_checkpoint_of_two_processes_goes_on_with_one(
     found: dict[str, Any], kind: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -124,6 +129,7 @@ def test_the_checkpoint_of_two_processes_goes_on_with_one(
     assert trainer.primitives == pytest.approx(found["alone"][0][f"run {kind}"]["primitives"], rel=0.05)
 
 
+@pytest.mark.slow
 def test_ranks_that_have_come_apart_are_told_with_rank_step_and_name(found: dict[str, Any]) -> None:
     for rank in found["together"]:
         assert rank["diverging"].startswith(
@@ -131,16 +137,19 @@ def test_ranks_that_have_come_apart_are_told_with_rank_step_and_name(found: dict
         )
 
 
+@pytest.mark.slow
 def test_ctrl_c_at_one_rank_stops_all_after_the_same_step_with_a_checkpoint(found: dict[str, Any]) -> None:
     assert [rank["stopped"]["step"] for rank in found["together"]] == [6, 6]
     assert found["together"][0]["stopped"]["written"]
 
 
+@pytest.mark.slow
 def test_a_rank_without_a_view_is_refused_with_the_remedy(found: dict[str, Any]) -> None:
     for rank in found["together"]:
         assert "views_per_step = 1: 2 processes need a view each; set it to 2" in rank["too few views"]
 
 
+@pytest.mark.slow
 def test_a_rank_that_ends_ends_the_others_with_one_line(found: dict[str, Any]) -> None:
     said = found["together"][0]["gone"]
     assert said.startswith("TrainingError: rank 0 of 2: another rank has ended or cannot be reached")
@@ -162,6 +171,7 @@ def test_alone_nothing_is_sent_and_nothing_changes(blob_scene: Scene, tiny_confi
     distributed.check_identical(0, {"a": parameter})
 
 
+@pytest.mark.slow
 def test_torchrun_trains_one_file_and_says_everything_once(tmp_path: Path, found: dict[str, Any]) -> None:
     """The command as it is typed, but for torchrun's own work: two processes with its variables."""
     with socket.socket() as free:

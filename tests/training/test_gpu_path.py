@@ -10,6 +10,7 @@ import compgs
 from compgs.cameras import Camera
 from compgs.gaussians import Gaussians
 from compgs.render.settings import DEFAULT_SETTINGS
+from compgs.scene.views import View
 from compgs.tensors import gsplat_backend, where
 from compgs.tensors.reference import Splats, composite, project
 from compgs.training.hybrid import train
@@ -77,49 +78,63 @@ def gpu_path(monkeypatch) -> StandIn:
     return stand_in
 
 
+@pytest.fixture(scope="module")
+def few_pixels(blob_scene):
+    """Half of the views, at half the width and height: plain torch draws slowly."""
+
+    def smaller(view):
+        return View(view.name, view.camera.resized(24, 18), np.ascontiguousarray(view.image[::2, ::2]))
+
+    return replace(
+        blob_scene,
+        train_views=tuple(map(smaller, blob_scene.train_views[::2])),
+        test_views=tuple(map(smaller, blob_scene.test_views)),
+    )
+
+
 def small(config, **training):
     return replace(config, training=replace(config.training, steps=10, **training))
 
 
 def test_a_whole_run_on_the_gpus_path_writes_a_file_that_the_cpu_draws_alike(
-    gpu_path, blob_scene, tiny_config, tmp_path, monkeypatch
+    gpu_path, few_pixels, tiny_config, tmp_path, monkeypatch
 ):
-    model = train(blob_scene, small(tiny_config), output=tmp_path / "run", device="cpu")
-    drawn_there = np.asarray(compgs.render(model, blob_scene.test_views[0].camera).image)
+    model = train(few_pixels, small(tiny_config), output=tmp_path / "run", device="cpu")
+    drawn_there = np.asarray(compgs.render(model, few_pixels.test_views[0].camera).image)
     assert gpu_path.drawings > 10  # each step, and each view of growth and the end
     monkeypatch.undo()
     compgs.encode(model, tmp_path / "scene.cgs")
     decoded = compgs.decode(tmp_path / "scene.cgs")
-    here = np.asarray(compgs.render(decoded, blob_scene.test_views[0].camera).image)
+    here = np.asarray(compgs.render(decoded, few_pixels.test_views[0].camera).image)
     assert np.sqrt(((here - drawn_there) ** 2).mean()) < 1e-3
 
 
-def test_a_run_on_the_gpus_path_goes_on_as_if_it_had_not_stopped(gpu_path, blob_scene, tiny_config, tmp_path):
+def test_a_run_on_the_gpus_path_goes_on_as_if_it_had_not_stopped(gpu_path, few_pixels, tiny_config, tmp_path):
     config = replace(tiny_config, training=replace(tiny_config.training, steps=20))
-    whole = train(blob_scene, config, device="cpu")
+    whole = train(few_pixels, config, device="cpu")
 
     def stop(status):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):  # after ten steps, the first report
-        train(blob_scene, config, output=tmp_path / "run", device="cpu", progress=stop)
-    resumed = train(blob_scene, config, output=tmp_path / "run", resume=True, device="cpu")
+        train(few_pixels, config, output=tmp_path / "run", device="cpu", progress=stop)
+    resumed = train(few_pixels, config, output=tmp_path / "run", resume=True, device="cpu")
     assert torch.equal(resumed.references, whole.references)
 
 
 @pytest.mark.parametrize("change", [{"exposure": True}, {"robust": True}, {"views_per_step": 4}])
-def test_each_option_takes_its_steps_on_the_gpus_path(gpu_path, blob_scene, tiny_config, change):
+def test_each_option_takes_its_steps_on_the_gpus_path(gpu_path, few_pixels, tiny_config, change):
     losses = []
-    train(blob_scene, small(tiny_config, **change), device="cpu", progress=lambda s: losses.append(s.loss))
+    train(few_pixels, small(tiny_config, **change), device="cpu", progress=lambda s: losses.append(s.loss))
     assert losses and np.isfinite(losses).all() and gpu_path.drawings >= 10
 
 
-def test_the_gpus_path_learns_as_the_kernels_do(blob_scene, tiny_config, gpu_path, monkeypatch):
+def test_the_gpus_path_learns_as_the_kernels_do(few_pixels, tiny_config, gpu_path, monkeypatch):
     config = small(tiny_config, rules=without(tiny_config.training.rules, "sampled_gradients"))
     losses = []
     for _ in range(2):  # first by torch, then by kernels
         seen: list[float] = []
-        train(blob_scene, config, device="cpu", progress=lambda s, seen=seen: seen.append(s.loss))
+        train(few_pixels, config, device="cpu", progress=lambda s, seen=seen: seen.append(s.loss))
         losses.append(seen)
         monkeypatch.undo()
     assert losses[0] == pytest.approx(losses[1], rel=0.02)

@@ -32,6 +32,7 @@ from .test_picture import CONTENTS, looking, psnr
 sys.path.append(str(WEB.parent / "benchmarks"))
 from made_heads import VIEW_DIM, make_heads
 
+pytestmark = pytest.mark.slow
 LEAST_DB = 35.0
 WIDTH, HEIGHT = 240, 160
 ENGINES = ("spark", "playcanvas", "three")
@@ -193,7 +194,6 @@ def settles_to(page: Page, model: HybridModel, view: int = 0) -> None:
     raise AssertionError(f"{best:.1f} dB at best; the page says: {page.ask('said.join()')}")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_five_lines_show_a_file(
@@ -213,7 +213,6 @@ def test_five_lines_show_a_file(
         assert page.ask("said.join()") == ""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_colors_follow_the_camera_of_the_example_pages(
     engine: str, node: str, browser: str, project: Path, tmp_path: Path
@@ -240,7 +239,6 @@ def test_colors_follow_the_camera_of_the_example_pages(
         assert until(lambda: page.ask("window.splats?.isSettled"), "colors of the camera at hand")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_the_beginning_of_a_file_is_shown_before_the_rest(
     engine: str, node: str, browser: str, project: Path, tmp_path: Path
@@ -306,7 +304,6 @@ window.result = JSON.stringify({ names, counts, bytes: data.byteLength, damaged,
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("engine", REGISTERED)
 def test_engines_know_the_files_by_ending_and_media_type_and_name_what_is_wrong(
     engine: str, node: str, browser: str, project: Path, tmp_path: Path

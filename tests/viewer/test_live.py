@@ -19,6 +19,7 @@ from compgs.viewer.live import LiveViewer  # noqa: E402
 from compgs.viewer.shown import FileShown  # noqa: E402
 from compgs.viewer.stage import OwnThread  # noqa: E402
 
+pytestmark = pytest.mark.slow
 LEAST_DB = 35.0
 WIDTH, HEIGHT = 900, 560
 # Beside the panel on the right, and below what the page says about its software WebGL: 150 to 190 pixels and their
@@ -63,7 +64,6 @@ def visit(browser: str, cgs_bytes: bytes, tmp_path_factory: pytest.TempPathFacto
         viewer.close()
 
 
-@pytest.mark.slow
 def test_the_page_shows_what_the_renderer_does(visit: Visit) -> None:
     until(visit.agrees, f"the page shows the renderer's picture, {LEAST_DB} dB")
     assert visit.expected().shape == (HEIGHT, WIDTH, 3)
@@ -72,7 +72,6 @@ def test_the_page_shows_what_the_renderer_does(visit: Visit) -> None:
     assert "100 anchors, 400 coupled primitives" in facts and f"{WIDTH} x {HEIGHT} pixels" in facts
 
 
-@pytest.mark.slow
 def test_a_drag_turns_the_camera_and_the_picture_follows(visit: Visit) -> None:
     before, shown = visit.controls.lens(), visit.expected()
     visit.page.drag((200, 300), (330, 340))
@@ -83,7 +82,6 @@ def test_a_drag_turns_the_camera_and_the_picture_follows(visit: Visit) -> None:
     until(visit.agrees, "the page shows what is to be seen from there")
 
 
-@pytest.mark.slow
 def test_a_jump_to_a_camera_shows_what_it_saw(visit: Visit) -> None:
     _, camera = visit.controls.shown.cameras[3]
     visit.controls._jump(camera)
@@ -93,7 +91,6 @@ def test_a_jump_to_a_camera_shows_what_it_saw(visit: Visit) -> None:
     until(visit.agrees, "the page shows what is to be seen from there")
 
 
-@pytest.mark.slow
 def test_the_field_of_view_and_the_background_are_the_visitor_s(visit: Visit) -> None:
     visit.controls._set_field_of_view(1.4)
     visit.controls.visitor.wish(background=(1.0, 1.0, 1.0))
@@ -102,7 +99,6 @@ def test_the_field_of_view_and_the_background_are_the_visitor_s(visit: Visit) ->
     assert visit.page.picture()[400, 20].min() > 240
 
 
-@pytest.mark.slow
 def test_overlays_are_drawn_over_the_picture_and_go_again(visit: Visit) -> None:
     until(visit.agrees, "the picture without")
     before = visit.page.picture()[FREE].astype(int)
@@ -117,7 +113,6 @@ def test_overlays_are_drawn_over_the_picture_and_go_again(visit: Visit) -> None:
     until(visit.agrees, "the picture without")
 
 
-@pytest.mark.slow
 def test_nothing_is_loaded_from_elsewhere(visit: Visit) -> None:
     """And nothing could be: the browser finds no other machine (`tab`), also in its workers."""
     visit.page.picture()
@@ -125,12 +120,10 @@ def test_nothing_is_loaded_from_elsewhere(visit: Visit) -> None:
     assert {urlsplit(each).hostname for each in addresses if not each.startswith("data:")} == {"127.0.0.1"}
 
 
-@pytest.mark.slow
 def test_no_visitor_can_ask_for_a_public_address(visit: Visit) -> None:
     assert visit.viewer.server.request_share_url() is None
 
 
-@pytest.mark.slow
 def test_a_visitor_who_leaves_is_forgotten(visit: Visit) -> None:
     visit.page.open("about:blank")
     until(lambda: not visit.viewer.controls, "nobody there")

@@ -14,6 +14,7 @@ from compgs.viewer import html_page
 from .devtools import Page, tab, until
 from .test_picture import CONTENTS, written
 
+pytestmark = pytest.mark.slow
 DESK, PHONE = (1280, 800), (390, 844)
 IS_SHOWN = "document.getElementById('status').textContent.includes(' in ')"
 IS_AT_REST = "!compgsViewer.controls.isBusy && !compgsViewer.isMoving"
@@ -79,7 +80,6 @@ def is_hidden(page: Page, name: str) -> bool:
     return bool(page.ask(f"document.getElementById('{name}').hidden"))
 
 
-@pytest.mark.slow
 def test_keys_move_before_a_click_and_after_a_button(opened: Page) -> None:
     before = numbers(opened, CENTRE)
     key(opened, "KeyW", "w")
@@ -92,7 +92,6 @@ def test_keys_move_before_a_click_and_after_a_button(opened: Page) -> None:
     assert np.dot(numbers(opened, CENTRE) - ahead, numbers(opened, FORWARD)) < 0
 
 
-@pytest.mark.slow
 def test_a_movement_runs_out_and_the_picture_is_then_of_full_size(opened: Page) -> None:
     x, y = DESK[0] // 2, DESK[1] // 2
     opened.drag((x, y), (x + 150, y))
@@ -104,7 +103,6 @@ def test_a_movement_runs_out_and_the_picture_is_then_of_full_size(opened: Page) 
     assert (width, height) == (opened.ask("innerWidth"), opened.ask("innerHeight"))
 
 
-@pytest.mark.slow
 def test_pictures_are_smaller_while_somebody_moves_and_frames_are_late(opened: Page) -> None:
     opened.ask("compgsViewer.pace.share = 0.25")
     opened.call("Input.dispatchKeyEvent", type="keyDown", code="KeyD", key="d")
@@ -113,7 +111,6 @@ def test_pictures_are_smaller_while_somebody_moves_and_frames_are_late(opened: P
     until(lambda: opened.ask("compgsViewer.canvas.width === innerWidth"), "a sharp picture")
 
 
-@pytest.mark.slow
 def test_a_double_click_turns_about_what_is_there_and_beside_the_scene_does_nothing(opened: Page) -> None:
     place = next(
         (x, y) for y in range(200, 640, 40) for x in range(320, 960, 40) if is_something_at(opened, x, y)
@@ -140,7 +137,6 @@ def is_something_at(page: Page, x: int, y: int) -> bool:
     return bool(until(lambda: page.ask("window.found"), "an answer") == "true")
 
 
-@pytest.mark.slow
 def test_nobody_gets_through_what_they_look_at_or_out_of_sight(opened: Page) -> None:
     extent = opened.ask("compgsViewer.controls.place.extent")
     for wheel, check in ((-3000, lambda d: d >= 0.0099 * extent), (9000, lambda d: d <= 25 * extent)):
@@ -152,7 +148,6 @@ def test_nobody_gets_through_what_they_look_at_or_out_of_sight(opened: Page) -> 
     assert np.linalg.norm(numbers(opened, CENTRE) - middle) <= 12.001 * extent
 
 
-@pytest.mark.slow
 def test_the_panel_has_field_of_view_and_background_and_escape_shuts_it(opened: Page) -> None:
     opened.ask("document.getElementById('ask').click()")
     assert not is_hidden(opened, "help")
@@ -168,7 +163,6 @@ def test_the_panel_has_field_of_view_and_background_and_escape_shuts_it(opened: 
     assert opened.picture()[50, 50].tolist() == [255, 255, 255]
 
 
-@pytest.mark.slow
 def test_beyond_a_scene_there_is_no_black_hole(opened: Page) -> None:
     opened.ask("compgsViewer.controls.target.pose.turn([0, 1, 0], Math.PI)")
     key(opened, "KeyQ", "q", 0.05)
@@ -177,7 +171,6 @@ def test_beyond_a_scene_there_is_no_black_hole(opened: Page) -> None:
     assert opened.picture()[50, 50].tolist() == [0x2B, 0x2F, 0x36]
 
 
-@pytest.mark.slow
 def test_a_picture_is_saved_as_it_is_shown(opened: Page) -> None:
     opened.ask(
         "compgsViewer.screenshot().then((blob) => blob.arrayBuffer()).then((bytes) =>"
@@ -188,7 +181,6 @@ def test_a_picture_is_saved_as_it_is_shown(opened: Page) -> None:
     assert int.from_bytes(head[16:20], "big") == opened.ask("innerWidth")
 
 
-@pytest.mark.slow
 def test_a_hint_is_there_at_first_and_fades_with_the_first_movement(opened: Page) -> None:
     faded = "document.getElementById('hint').classList.contains('gone')"
     assert not opened.ask(faded)
@@ -197,7 +189,6 @@ def test_a_hint_is_there_at_first_and_fades_with_the_first_movement(opened: Page
     assert until(lambda: opened.ask(faded), "a hint that fades")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("head", "title", "text"),
     [
@@ -234,7 +225,6 @@ def test_files_of_other_kinds_are_named_and_close_leads_back(
     assert is_hidden(desk, "error") and not is_hidden(desk, "welcome")
 
 
-@pytest.mark.slow
 def test_on_a_phone_fingers_turn_and_come_nearer_and_buttons_fit(
     browser: str, scene: Path, tmp_path: Path
 ) -> None:

@@ -87,8 +87,10 @@ def test_another_dilation_would_be_seen(name: str, camera: int, wrong: float, tm
     assert psnr(to_8bit(found), to_8bit(expected)) < LEAST_DB - 5
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CONTENTS)
+@pytest.mark.parametrize(
+    "name",
+    [name if name == "dilated" else pytest.param(name, marks=pytest.mark.slow) for name in CONTENTS],
+)
 def test_the_page_shows_what_the_renderer_does(name: str, browser: str, tmp_path: Path) -> None:
     content = CONTENTS[name]
     model = decoded(content, tmp_path)
@@ -102,7 +104,6 @@ def test_the_page_shows_what_the_renderer_does(name: str, browser: str, tmp_path
         assert psnr(picture, expected) >= LEAST_DB
 
 
-@pytest.mark.slow
 def test_a_damaged_file_is_named_in_the_page(browser: str, tmp_path: Path) -> None:
     data = bytearray(written(CONTENTS["paired"]))
     data[-40] ^= 1

@@ -26,6 +26,7 @@ from compgs.viewer.thumbnails import Thumbnails
 from .devtools import Page, tab, until
 from .test_picture import CONTENTS, looking, written
 
+pytestmark = pytest.mark.slow
 SIDE = 3  # tiles of the town
 LEAST_DB = 35.0
 WIDTH, HEIGHT = 320, 240
@@ -117,7 +118,6 @@ def check_nothing_twice(town: Town) -> None:
             end = last + 1
 
 
-@pytest.mark.slow
 def test_tiles_are_fetched_as_they_are_looked_at_and_their_picture_is_the_renderers(
     town: Town, browser: str, tmp_path: Path
 ) -> None:
@@ -137,7 +137,6 @@ def test_tiles_are_fetched_as_they_are_looked_at_and_their_picture_is_the_render
     check_nothing_twice(town)
 
 
-@pytest.mark.slow
 def test_a_walk_with_a_cap_never_holds_more_splats_and_shows_what_is_near(
     town: Town, browser: str, tmp_path: Path
 ) -> None:

@@ -20,6 +20,7 @@ from .devtools import tab, until
 from .headless import WEBGPU_FLAGS, Visit, offers_webgpu, visit
 from .test_picture import CONTENTS, SHARED, cameras_around, looking, make_content, written
 
+pytestmark = pytest.mark.slow
 LEAST_DB = 45.0
 # Opens the page's file once more before the last camera: its splats take the place of those that are there.
 OPENS_AGAIN = """window.beforeCamera = async (index) => {
@@ -122,7 +123,6 @@ def check(seen: Visit, shown: Shown, *drawn: str) -> None:
         assert psnr(np.ascontiguousarray(picture), expected) >= LEAST_DB
 
 
-@pytest.mark.slow
 def test_webgpu_draws_what_the_renderer_and_webgl2_do(webgpu: str, tmp_path: Path) -> None:
     content = make_content(14_000, 3, SHARED)  # more splats than the worker colors at once
     shown = from_three_cameras(content, tmp_path)
@@ -136,7 +136,6 @@ def test_webgpu_draws_what_the_renderer_and_webgl2_do(webgpu: str, tmp_path: Pat
     assert abs(pictures["webgpu"] - pictures["webgl2"]).max() <= 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("harm", "reason"), [(DESTROYED, ""), (OUT_OF_MEMORY, "no memory")], ids=["destroyed", "out of memory"]
 )
@@ -150,20 +149,17 @@ def test_webgl2_goes_on_where_webgpu_stops(
     assert line.endswith("). WebGL2 goes on with the drawing.")
 
 
-@pytest.mark.slow
 def test_a_renderer_that_was_asked_for_is_not_replaced(webgpu: str, shown: Shown, tmp_path: Path) -> None:
     script = LOSES % OUT_OF_MEMORY
     seen = visit(webgpu, tmp_path, shown.page, shown.cameras[:2], WEBGPU_FLAGS, "?renderer=webgpu", script)
     assert (seen.error, seen.drawn) == (LOST % "no memory", ["webgpu", "webgpu"])
 
 
-@pytest.mark.slow
 def test_nothing_takes_over_from_webgl2(browser: str, shown: Shown, tmp_path: Path) -> None:
     seen = visit(browser, tmp_path, shown.page, shown.cameras[:2], script=LOSES % CONTEXT_LOST)
     assert (seen.error, seen.drawn) == (LOST % "the context is lost", ["webgl2", "webgl2"])
 
 
-@pytest.mark.slow
 def test_a_scene_too_large_for_webgpu_is_refused(webgpu: str, shown: Shown, tmp_path: Path) -> None:
     seen = visit(webgpu, tmp_path, shown.page, [], WEBGPU_FLAGS, script=HAS_SMALL_BUFFERS)
     assert "The scene has more splats than the 1,365 that this device's graphics can hold." in seen.error
@@ -194,7 +190,6 @@ def opened(
         server.shutdown()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("script", "reason"),
     [
@@ -211,7 +206,6 @@ def test_webgl2_draws_where_there_is_no_webgpu(
     assert opened(script, "") == {"error": ": ", "turns": True, "webgl2": True, "console": [line]}
 
 
-@pytest.mark.slow
 def test_a_camera_that_is_shown_before_the_scene_is_there_can_be_turned(
     opened: Callable[[str, str], dict[str, Any]],
 ) -> None:
@@ -219,7 +213,6 @@ def test_a_camera_that_is_shown_before_the_scene_is_there_can_be_turned(
     assert found["error"] == ": " and found["turns"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("script", "query", "error"),
     [
