@@ -4,7 +4,8 @@ Scenes are colored blobs, photographed by the rasterizer; what was trained is en
 with the photographs and with the model it was written from.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -227,10 +228,23 @@ def gain(model: Renderable, views: Sequence[View]) -> float:
     return float(np.mean(gains))
 
 
+@pytest.fixture(scope="module")
+def learned() -> Callable[[str, Config], tuple[Scene, TrainedModel]]:
+    """A scene by its name, and the model that the settings of these tests give: trained once."""
+
+    @functools.cache
+    def learn(name: str, config: Config) -> tuple[Scene, TrainedModel]:
+        scene = SCENES[name]()
+        return scene, trained(scene, config)
+
+    return learn
+
+
 @pytest.mark.parametrize("name", SCENES)
-def test_an_odd_scene_is_learned_and_its_file_shows_it(name: str, config: Config, tmp_path: Path) -> None:
-    scene = SCENES[name]()
-    model = trained(scene, config)
+def test_an_odd_scene_is_learned_and_its_file_shows_it(
+    name: str, config: Config, learned: Callable[[str, Config], tuple[Scene, TrainedModel]], tmp_path: Path
+) -> None:
+    scene, model = learned(name, config)
     encode(model, tmp_path / "odd.cgs")
     decoded = decode(tmp_path / "odd.cgs")
     assert gain(decoded, scene.train_views) > 1.5
@@ -244,9 +258,11 @@ def test_an_odd_scene_is_learned_and_its_file_shows_it(name: str, config: Config
 
 
 @pytest.mark.parametrize("name", ["portrait", "forward_facing", "differing_sizes", "one_object_on_white"])
-def test_views_that_were_held_out_are_recognizable(name: str, config: Config) -> None:
-    scene = SCENES[name]()
-    assert gain(trained(scene, config).as_hybrid_model(), scene.test_views) > 3.0
+def test_views_that_were_held_out_are_recognizable(
+    name: str, config: Config, learned: Callable[[str, Config], tuple[Scene, TrainedModel]]
+) -> None:
+    scene, model = learned(name, config)
+    assert gain(model.as_hybrid_model(), scene.test_views) > 3.0
 
 
 def test_the_unit_of_length_does_not_matter(config: Config) -> None:
