@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 BENCHMARK = Path(__file__).resolve().parents[1] / "benchmarks" / "rendering.py"
 
 
+@pytest.mark.slow
 def test_a_small_scene_is_decoded_and_rendered_and_its_parts_are_those_of_a_frame(tmp_path: Path) -> None:
     found = tmp_path / "found.json"
     command = [sys.executable, str(BENCHMARK), "--anchors", "500", "--width", "64", "--height", "48"]

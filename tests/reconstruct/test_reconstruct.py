@@ -121,6 +121,7 @@ def test_options_out_of_range_are_refused(options: dict[str, object], walls: Wal
         reconstruct(walls.folder, tmp_path / "scene", ReconstructOptions(**options))  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_photographs_that_look_alike_are_joined_as_if_all_had_been_compared(
     walls: Walls, found: Reconstruction, tmp_path: Path
 ) -> None:

@@ -115,7 +115,7 @@ def longer(tiny_config):
     )
 
 
-@pytest.mark.parametrize("target", [4600, 5100])
+@pytest.mark.parametrize("target", [4600, pytest.param(5100, marks=pytest.mark.slow)])
 def test_one_training_gives_a_file_of_the_size_that_was_asked_for(blob_scene, longer, tmp_path, target):
     config = replace(longer, training=replace(longer.training, target_bytes=target))
     trainer = Trainer(blob_scene, config, CPU)

@@ -5,6 +5,8 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
+
 import compgs
 
 from .conftest import WEB, run
@@ -16,6 +18,7 @@ def test_the_shipped_page_is_the_one_that_web_builds(built: Path) -> None:
     assert (built / "page.html").read_bytes() == PAGE.read_bytes(), "run make web, and commit page.html"
 
 
+@pytest.mark.slow
 def test_style_and_types_hold(node: str) -> None:
     run([node, "node_modules/typescript/bin/tsc", "--noEmit"])
     run([node, "node_modules/prettier/bin/prettier.cjs", "--check", "."])
