@@ -50,10 +50,11 @@ def page() -> str:
 
 RULES_INTRODUCTION = """## rules
 
-A rule replaces a setting above by facts that are known before the first step of a run (`src/compgs/training/plan.py`).
+A rule decides a value of the plan by facts that are known before the first step of a run
+(`src/compgs/training/plan.py`): most replace a setting above, others a value that only the plan has.
 `compgs train --plan` prints the decisions for a scene. `--set training.rules=none` applies no rule, as the `paper`
 preset does. `--set training.rules='all but NAME, NAME'` leaves some out. For rules, a requested size counts as the
-lambda that gives such files.
+lambda that gives such files; for those of the grid, which comes before there are anchors, the setting counts.
 
 | rule | decides | when | measured |
 |---|---|---|---|

@@ -87,4 +87,4 @@ def say_expected(plan: "Plan", scene: "Scene", settings: RunSettings, device: st
     elif bytes_ is None or settings.tiles is not None:
         say("file: size not known: no scene of about so many anchors has been measured")
     else:
-        say(f"file: about {size(round(bytes_))}, measured scenes were within a factor of 3")
+        say(f"file: about {size(round(bytes_))}, measured scenes were within a factor of 2, at worst 3.5")

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from compgs.cameras import Camera
 from compgs.scene.views import View
 
-# Pixels of a photograph as it is compared. A point is wanted every dozen pixels of a photograph ten times as large;
+# Pixels of a photograph as it is compared. A point is wanted every few pixels of a photograph ten times as large;
 # finer ones take longer, and find leaves that move.
 COMPARED_PIXELS = 60_000
 LUMA = (0.299, 0.587, 0.114)  # of ITU-R BT.601: what gray is made of

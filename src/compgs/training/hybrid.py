@@ -31,8 +31,8 @@ def train(
 
     Settings are those of `config`, or of a preset, `default` if there is neither. With `output`, a folder, checkpoints
     are written there, also when the run is interrupted; `resume` continues from the last one exactly as if the run had
-    not stopped (`compgs train --resume` cannot: it does not know how the scene was read). `profile` gathers where the
-    time goes. Default device: CUDA where there is one.
+    not stopped. `compgs train --resume` cannot continue such a run, as the folder does not say how the scene was read.
+    `profile` gathers where the time goes. Default device: CUDA where there is one.
 
     Raises ConfigError, CheckpointError, OutputError, and TrainingError when the optimization cannot go on.
     """

@@ -60,7 +60,8 @@ PASSED_OVER = 0.03
 class Start:
     """What is known of a run before its first step."""
 
-    anchors: int  # of the beginning; where a capture is trained in tiles, of one of them on average
+    # before points are looked for in the photographs; where a capture is trained in tiles, of one of them on average
+    anchors: int
     views: int  # training views; where a capture is trained in tiles, of all of them
     sightings: float  # training views that show a point, the median over the points
     passes: float  # over the training views, in the whole run
@@ -135,8 +136,8 @@ def _voxels(config: Config, start: Start, spacings: float) -> float:
     return spacings * max(1.0, dearer) ** (1 / 6)
 
 
-DENSE = "20,000 anchors and more, a point in 17 training views and more"  # `Start.dense` for people
-# Where two rules set the same value, the later one goes on from what the earlier one chose.
+DENSE = "20,000 anchors and more, a point in 17 training views and more, no tile"  # `Start.dense` for people
+# Where two rules set the same value, the later one is asked with what the earlier one chose.
 RULES: tuple[Rule, ...] = (
     Rule(
         "coarser_grid", "voxel_spacings", _voxels,
@@ -379,7 +380,7 @@ def plan(config: Config, start: Start) -> Plan:
             continue
         value = rule.to(config, known, values[rule.sets])
         if value != values[rule.sets]:
-            values[rule.sets], reasons[rule.sets] = value, rule.when
+            values[rule.sets], reasons[rule.sets] = value, f"{rule.name}: {rule.when}"
     return Plan(**values, start=start, reasons=reasons)
 
 

@@ -1,4 +1,4 @@
-"""How a training is carried out, whatever is trained: nothing here changes what comes out.
+"""How a training is carried out, whatever is trained: order, memory, saving, and the optimizer's step.
 
 | file | does |
 |---|---|

@@ -1,8 +1,8 @@
 """What each coupled primitive adds to the training views, and which ones they would miss.
 
 A primitive's *contribution* is the sum of its blending weights (transmittance times alpha) over the pixels of the
-views: what it adds to them, whatever its color. Anchors that add least are pruned while the others can still make up
-for them, and what hardly adds anything is left out of the file.
+views: what it adds to them, whatever its color. What hardly adds anything is left out of the file. (Prunings in
+a run go by `pruning.py`.)
 """
 
 from collections.abc import Callable, Sequence
