@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from compgs.numerics.evenly import evenly
+from compgs.numerics.freed_memory import give_back_freed
 from compgs.progress import Counting
 from compgs.scene.views import Points, Scene
 from compgs.stereo.fusion import Depths, agreed, thinned
@@ -17,7 +18,7 @@ from compgs.stereo.neighbours import asked_of, neighbours_of, sight_of
 from compgs.stereo.plane_sweep import swept
 
 SWEPT = 110  # photographs whose distances are found, evenly spread: the others are looked at as neighbours
-FEWEST_NEIGHBOURS = 2
+FEWEST_NEIGHBOURS = 2  # the sweep takes the mean of the best two
 
 
 @torch.no_grad()
@@ -31,10 +32,21 @@ def dense_points(
 
     The same photographs give the same points on the same kind of device.
     """
-    known = scene.points.positions
+    known, full = scene.points.positions, scene.train_views[0].camera
+    depths = _depths(scene, device, progress)
+    give_back_freed()
+    if not depths:
+        return Points(known[:0], scene.points.colors[:0])
+    points = thinned(agreed(depths), spacing * small_camera(full).width / full.width, known)
+    give_back_freed()  # before training, which keeps what is free
+    return points
+
+
+def _depths(scene: Scene, device: torch.device, progress: Counting | None) -> list[Depths]:
+    """Distances of the photographs that are swept. Raises UnreadableImage."""
     looks = looks_of(scene.train_views, device)
     cameras = [look.camera for look in looks]
-    asked = asked_of(known)
+    asked = asked_of(scene.points.positions)
     sights = [sight_of(camera, asked) for camera in cameras]
     chosen = evenly(len(looks), SWEPT)
     depths = []
@@ -52,7 +64,4 @@ def dense_points(
         depths.append(Depths(look.camera, look.color, found, step))
     if progress is not None:
         progress(len(chosen), len(chosen))
-    if not depths:
-        return Points(known[:0], scene.points.colors[:0])
-    full = scene.train_views[0].camera
-    return thinned(agreed(depths), spacing * small_camera(full).width / full.width, known)
+    return depths

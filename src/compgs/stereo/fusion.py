@@ -86,16 +86,32 @@ def thinned(places: Places, pixels: float, known: np.ndarray) -> Points:
     """
     levels = np.floor(np.log2(places.footprints * pixels))
     sides = np.exp2(levels)
-    keys = np.concatenate(
-        [np.floor(places.positions / sides[:, None]).astype(np.int64), levels[:, None].astype(np.int64)], 1
-    )
-    unique, cell, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    cell = cell.reshape(-1)
+    keys = [np.floor(places.positions[:, axis] / sides).astype(np.int64) for axis in range(3)]
+    keys.append(levels.astype(np.int64))
+    cell, first = _numbered(keys)
+    count = np.bincount(cell)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return np.stack([np.bincount(cell, column, len(count)) for column in values.T], 1) / count[:, None]
+        return np.stack([np.bincount(cell, column) for column in values.T], 1) / count[:, None]
 
-    positions, colors = mean(places.positions), mean(places.colors.astype(np.float64))
+    positions, colors = mean(places.positions), mean(places.colors)
     distances, _ = nearest(known, positions, 1)
-    kept = (count >= FEWEST) & (distances.reshape(-1) > APART * np.exp2(unique[:, 3]))
+    kept = (count >= FEWEST) & (distances.reshape(-1) > APART * np.exp2(keys[3][first]))
     return Points(positions[kept], np.round(colors[kept]).astype(np.uint8))
+
+
+def _numbered(keys: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """[P] the number of each of the tuples that keys [P] of integers make, equal tuples having one, in ascending order;
+    and [C] where each of the C different ones is.
+
+    `np.unique` of rows has the same numbers, and takes half as much memory again and twice the time.
+    """
+    order = np.lexsort(keys[::-1])
+    new = np.zeros(len(order), bool)  # of the ordered ones: whether it differs from the one before
+    new[:1] = True
+    for key in keys:
+        ordered = key[order]
+        new[1:] |= ordered[1:] != ordered[:-1]
+    number = np.empty(len(order), np.int64)
+    number[order] = np.cumsum(new) - 1
+    return number, order[new]
