@@ -40,8 +40,8 @@ def one_size(anchors: int, steps: int, *, encode: bool) -> dict[str, Any]:
     from made_scene import made_scene
     from training_step import trainer_in_mid_run
 
+    from compgs.numerics.freed_memory import freed_memory_kept
     from compgs.training.plan import LOOKED_AT
-    from compgs.training.run.allocation import freed_memory_kept
     from compgs.training.run.checkpoint import Writer
     from compgs.training.run.distributed import digest
     from compgs.training.run.profile import StepProfile

@@ -9,6 +9,7 @@ the same photographs give the same hash. Memory is that of the whole process, de
 
 import argparse
 import hashlib
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -59,7 +60,7 @@ def main() -> None:
     from compgs.stereo import dense_points
 
     torch.set_num_threads(args.threads)
-    module = __import__("sys").modules["compgs.stereo.dense_points"]
+    module = sys.modules[dense_points.__module__]
     scene = compgs.load_scene(args.scene, downscale=args.downscale)
     scene = replace(scene, train_views=scene.train_views[:: args.every])
     parts = {name: Measured(getattr(module, name)) for name in PARTS}

@@ -251,7 +251,7 @@ def main() -> None:
     parser.add_argument("--made", type=int, nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.job:
-        from compgs.training.run.allocation import freed_memory_kept
+        from compgs.numerics.freed_memory import freed_memory_kept
 
         with freed_memory_kept():  # as in a run
             print(json.dumps({"breakdown": breakdown, "growth": growth}[options.job](options)))

@@ -14,7 +14,7 @@ from compgs.cli.console import console, say, warn
 from compgs.cli.levels import LevelOption
 from compgs.cli.progress import counting, training
 from compgs.cli.settings import assigned, with_settings
-from compgs.cli.sizes import parse_size, parse_time
+from compgs.cli.sizes import check_one_of_time_and_steps, parse_size, parse_time
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.occupied import occupied
 from compgs.words import duration, size
@@ -142,8 +142,7 @@ class Compress(ComputingCommand, LevelOption):
         """Raises UsageError for options that do not go together."""
         if self.resume and self.overwrite:
             raise UsageError("--resume continues a run and --overwrite replaces it; give one of them")
-        if self.time is not None and self.steps is not None:
-            raise UsageError("--time chooses the steps, and --steps gives them; give one of them")
+        check_one_of_time_and_steps(self.time, self.steps)
         if not self.resume:
             if self.file is None:
                 raise UsageError(

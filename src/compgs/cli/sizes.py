@@ -24,6 +24,12 @@ def parse_time(text: str, option: str) -> float:
     return seconds
 
 
+def check_one_of_time_and_steps(time: str | None, steps: int | None) -> None:
+    """Raises UsageError for a time and steps together."""
+    if time is not None and steps is not None:
+        raise UsageError("--time chooses the steps, and --steps gives them; give one of them")
+
+
 def parse_size(text: str, option: str) -> int:
     """Bytes of `130kB`, `2 MB`, `1.5MiB` or `130000`; a kB is 1000 bytes. Raises UsageError that names the option."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]*)\s*", text)

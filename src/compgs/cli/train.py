@@ -14,7 +14,7 @@ from compgs.cli.plan import PLANNED, with_time
 from compgs.cli.ranks import several
 from compgs.cli.run_folder import RunSettings
 from compgs.cli.settings import check_settings_of, with_settings
-from compgs.cli.sizes import parse_size, parse_time
+from compgs.cli.sizes import check_one_of_time_and_steps, parse_size, parse_time
 from compgs.cli.training_command import TrainingCommand
 from compgs.cli.usage import UsageError, settings_of_options
 from compgs.cli.viewing import check_viewing, viewing
@@ -124,8 +124,7 @@ class Train(TrainingCommand):
         if self.time is None:
             return
         parse_time(self.time, "--time")
-        if self.steps is not None:
-            raise UsageError("--time chooses the steps, and --steps gives them; give one of them")
+        check_one_of_time_and_steps(self.time, self.steps)
         if method != PLANNED:
             raise UsageError(f"--time: nothing is known of the pace of --method {method}; give --steps")
         if several():

@@ -9,5 +9,5 @@
 | `products`, `vector_sums` | small matrix products and sums, in kernels |
 | `ssim` | structural similarity with its gradient, on the CPU |
 | `rotations`, `nearest`, `evenly` | quaternions, nearest neighbours, and a few of many, evenly spread |
-| `freed_memory` | gives memory that nothing is in back to the system |
+| `freed_memory` | keeps memory that was freed, or gives it back to the system |
 """

@@ -15,7 +15,6 @@
 | `shown_size` | estimates the size of the file as often as a run can spare the time |
 | `time_left` | weighs the steps that are to come by the size of their pictures |
 | `profile`, `history` | say where the time went, and how the quality rose |
-| `allocation` | keeps memory that a step frees for the next one |
 | `seen_points` | checks that poses and points fit together |
 | `finished` | loads the model of a run that has ended |
 """

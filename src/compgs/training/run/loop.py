@@ -7,7 +7,7 @@ import torch
 
 from compgs.config import TrainingConfig
 from compgs.interrupt import held_back
-from compgs.training.run.allocation import freed_memory_kept
+from compgs.numerics.freed_memory import freed_memory_kept
 from compgs.training.run.any_trainer import AnyTrainer, Watch
 from compgs.training.run.distributed import rank, stopping_together, world
 from compgs.training.run.divergence import diverged
