@@ -16,6 +16,8 @@ from typing import Any
 import pytest
 
 from compgs.cli.main import main
+from compgs.cli.run_folder import RunSettings
+from compgs.cli.train import Train
 from compgs.cli.training_command import TrainingCommand
 from compgs.formats.refining import refine
 from compgs.scene.generated import generate_scene
@@ -74,17 +76,22 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shorten(patch: pytest.MonkeyPatch) -> None:
-    whole = TrainingCommand.settings
+    whole, timed = TrainingCommand.settings, Train.timed
 
     def settings(self: TrainingCommand, folder: Path) -> Any:
         asked = whole(self, folder)
-        training = asked.config.training
-        config = replace(asked.config, training=replace(training, steps=min(STEPS, training.steps)))
-        return asked if self.resume else replace(asked, config=config)
+        return asked if self.resume else of_few_steps(asked)
 
     patch.setattr(TrainingCommand, "settings", settings)
+    patch.setattr(Train, "timed", lambda self, asked, scene: of_few_steps(timed(self, asked, scene)))
     patch.setattr("compgs.suites.jobs._run", in_this_process)
     patch.setattr("compgs.exporting.refine_splats", refined_shortly)
+
+
+def of_few_steps(asked: RunSettings) -> RunSettings:
+    training = asked.config.training
+    config = replace(asked.config, training=replace(training, steps=min(STEPS, training.steps)))
+    return replace(asked, config=config)
 
 
 def refined_shortly(baked: Any, model: Any, cameras: Any, steps: int, *others: Any, **named: Any) -> Any:
