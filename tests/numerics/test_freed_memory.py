@@ -38,7 +38,7 @@ def test_gaps_between_arrays_that_stay_go_back_to_the_system() -> None:
     assert all(array.all() for array in small)
 
 
-def faults_of_an_array() -> int:
+def faults_of_an_array(megabytes: int = MEGABYTES) -> int:
     import resource
 
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -46,8 +46,8 @@ def faults_of_an_array() -> int:
     library = ctypes.CDLL(None)
     library.malloc.restype, library.free.argtypes = ctypes.c_void_p, (ctypes.c_void_p,)
     library.malloc.argtypes = (ctypes.c_size_t,)
-    place = library.malloc(MEGABYTES << 20)
-    np.ctypeslib.as_array((ctypes.c_uint8 * (MEGABYTES << 20)).from_address(place))[:: mmap.PAGESIZE] = 1
+    place = library.malloc(megabytes << 20)
+    np.ctypeslib.as_array((ctypes.c_uint8 * (megabytes << 20)).from_address(place))[:: mmap.PAGESIZE] = 1
     library.free(place)
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
@@ -76,9 +76,10 @@ with freed_memory_kept():
 
 
 def test_afterwards_memory_goes_back_to_the_system() -> None:
-    program = """
+    """That of the array before, and of later ones. These are larger: the place of the first may be between others."""
+    program = f"""
 with freed_memory_kept():
     faults_of_an_array()
-print(faults_of_an_array(), faults_of_an_array())
+print(faults_of_an_array(), faults_of_an_array({2 * MEGABYTES}), faults_of_an_array({2 * MEGABYTES}))
 """
     assert min(in_a_fresh_process(program)) > (MEGABYTES << 20) // mmap.PAGESIZE // 2
