@@ -25,8 +25,8 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
 
 def test_the_commands_are_there() -> None:
     assert NAMES == [
-        "reconstruct", "train", "tiles", "compress", "encode", "decode", "render", "evaluate", "view", "compare",
-        "report", "benchmark", "export", "serve", "info", "demo-scene",
+        "reconstruct", "adjust", "train", "tiles", "compress", "encode", "decode", "render", "evaluate", "view",
+        "compare", "report", "benchmark", "export", "serve", "info", "demo-scene",
     ]  # fmt: skip
 
 
@@ -115,6 +115,7 @@ def test_rubbish_in_place_of_a_number_is_named_with_its_option_and_what_was_expe
     needed = {
         "render": ["-o", "out"],
         "reconstruct": ["-o", "out"],
+        "adjust": ["-o", "out"],
         "export": ["out.ply"],
         "compare": ["other"],
         "report": ["-o", "out.html"],
@@ -176,7 +177,7 @@ DEMO = ["demo-scene", "scene"]
         ([*DEMO, "--seed", "-1"], "--seed -1: expected 0 to 2147483647"),
         (
             ["trian", "scene"],
-            "trian: there is no such command (did you mean train?); there are reconstruct, train",
+            "trian: there is no such command (did you mean train?); there are reconstruct, adjust",
         ),
         (["--steps", "3"], "--steps: there is no such command"),
     ],

@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from compgs import __version__
+from compgs.cli.adjust import Adjust
 from compgs.cli.arguments import command_name, parse_command
 from compgs.cli.benchmark import Benchmark
 from compgs.cli.command import Command
@@ -41,6 +42,7 @@ from compgs.interrupt import Terminated, ended_on_request, held_back
 
 COMMANDS: tuple[type[Command], ...] = (
     Reconstruct,
+    Adjust,
     Train,
     Tiles,
     Compress,

@@ -98,7 +98,7 @@ class Reconstruct(Command):
             threads=self.threads,
             seed=self.seed,
         )
-        with settings_of_options(), _stages() as progress:
+        with settings_of_options(), stages_shown() as progress:
             result = reconstruct(
                 self.photographs, self.output, options, overwrite=self.overwrite, progress=progress
             )
@@ -139,7 +139,7 @@ def remedy(matching: str) -> str:
 
 
 @contextmanager
-def _stages() -> "Iterator[StageProgress]":
+def stages_shown() -> "Iterator[StageProgress]":
     """A bar, or lines, for each stage in turn."""
     if not console.is_terminal:
         lines: dict[str, Callable[[int, int], None]] = {}

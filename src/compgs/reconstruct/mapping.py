@@ -1,4 +1,4 @@
-"""Features, matches, poses: COLMAP's three stages, in a process of their own that is watched from here."""
+"""Features, matches, poses: COLMAP's stages, in a process of their own that is watched from here."""
 
 import contextlib
 import json
@@ -14,10 +14,11 @@ from typing import Any, Literal
 
 from compgs.errors import SceneError
 from compgs.extras import require
+from compgs.reconstruct.adjusting import ROUNDS
 from compgs.reconstruct.cameras import SharedCamera
 from compgs.reconstruct.retrieval import ALIKE, NEAR
 
-Stage = Literal["features", "matching", "mapping"]
+Stage = Literal["features", "matching", "mapping", "adjusting"]
 Progress = Callable[[Stage, int, int], None]  # stage, done, total
 
 LOOK_SECONDS = 1.0  # between two looks at how far a stage is
@@ -41,6 +42,22 @@ class Job:
     seed: int
 
 
+@dataclass(frozen=True)
+class AdjustJob:
+    """What the worker is told to adjust given cameras, as JSON."""
+
+    images: str  # folder: photographs of one camera lie in one folder
+    database: str  # file that it makes
+    pairs: str  # file: two names a line
+    given: str  # folder of the sparse model
+    names: dict[str, str]  # of the given model's images -> of files in `images`
+    adjusted: str  # folder for the new model
+    features: int  # most of a photograph
+    feature_size: int  # pixels: larger photographs are shrunk to find features
+    threads: int | None
+    seed: int
+
+
 def check_colmap() -> None:
     """Raises MissingDependency, with the remedy, where pycolmap is not installed."""
     require("reconstruct", "finding poses")
@@ -52,6 +69,15 @@ def run_colmap(job: Job, photographs: int, progress: Progress) -> None:
     log = Path(job.database).with_name("colmap.log")
     with _worker(asdict(job), log) as process:
         _watch(process, Path(job.database), photographs, pairs, progress)
+
+
+def adjust_cameras(job: AdjustJob, photographs: int, progress: Progress) -> dict[str, Any]:
+    """Runs the adjustment; the new model is then in `job.adjusted`. What the worker tells of it. Raises SceneError."""
+    database = Path(job.database)
+    with _worker(asdict(job), database.with_name("colmap.log")) as process:
+        _watch(process, database, photographs, 0, progress)
+    told: dict[str, Any] = json.loads(database.with_name("adjusted.json").read_text(encoding="utf-8"))
+    return told
 
 
 def undistort_images(images: Path, model: Path, target: Path) -> None:
@@ -128,9 +154,12 @@ def _watch(
             progress("mapping", registered, photographs)
         elif told["event"] == "pairs":
             pairs = told["count"]
+        elif told["event"] == "round":
+            progress("adjusting", told["count"], ROUNDS)
         else:
             stage = told["event"]
-            progress(told["event"], 0, pairs if stage == "matching" else photographs)
+            totals = {"matching": pairs, "adjusting": ROUNDS}
+            progress(told["event"], 0, totals.get(told["event"], photographs))
 
 
 def _count(database: Path, table: str) -> int:

@@ -65,6 +65,15 @@ def find_photographs(folder: Path) -> list[Photograph]:
     return photographs
 
 
+def is_upright(path: Path) -> bool:
+    """Whether a photograph is stored as it is to be seen. Raises UnreadableImage."""
+    try:
+        with open_image(path) as image:
+            return image.getexif().get(ROTATED, 1) in (0, 1)
+    except DAMAGED as error:
+        raise UnreadableImage(f"{path}: cannot be read ({error}); remove it or save it again") from error
+
+
 def store_upright(photographs: Sequence[Photograph], folder: Path) -> None:
     """Writes the photographs to `folder` by their names: files as they are, unless they must be turned or converted."""
     for photograph in photographs:

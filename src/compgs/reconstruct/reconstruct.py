@@ -90,7 +90,7 @@ def _reconstruct_in(
         result = _reconstruct(source, scene, work, options, _Clock(progress or _silent))
         if note is not None and result.matching == "exhaustive" and result.photographs > EXHAUSTIVE_UP_TO:
             note("every pair of photographs was compared; --matching retrieval is faster")
-        _move_into_place(work / "scene", scene)
+        move_into_place(work / "scene", scene)
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return result
@@ -223,7 +223,7 @@ def _undistorted(target: Path, model: Path, place: Path) -> Path:
     return place / "sparse"
 
 
-def _move_into_place(new: Path, scene: Path) -> None:
+def move_into_place(new: Path, scene: Path) -> None:
     """An earlier folder stays until the new one takes its place."""
     earlier = new.with_name("earlier")
     if scene.exists():

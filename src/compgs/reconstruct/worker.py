@@ -12,11 +12,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from compgs.reconstruct.adjusting import adjust
+
 
 def main() -> None:
     job: dict[str, Any] = json.load(sys.stdin)
     if "undistorted" in job:
         undistort(job)
+    elif "adjusted" in job:
+        adjust(job, _tell)
     else:
         find_poses(job)
 

@@ -45,8 +45,7 @@ def read_colmap(folder: Path, sparse: Path, images: Path) -> Capture:
         place = f"{sparse}, image {image.name!r}"
         camera, lens = _pinhole_and_lens(model.cameras[image.camera_id], _pose(image, place), place)
         check_camera(camera, place)
-        # Some models have names relative to the scene's folder.
-        path = names.find(images, image.name) or names.find(folder, image.name) or images / image.name
+        path = image_path(image.name, folder, images, names)
         posed.append(PosedImage(as_name(image.name), path, camera, lens))
     points, source, files, notes = _points(model, sparse)
     if len({file.suffix.lower() for file in model.files}) > 1:
@@ -73,6 +72,11 @@ def read_colmap(folder: Path, sparse: Path, images: Path) -> Capture:
         split=" and ".join(str(file.relative_to(folder)) for file in lists) if held_out else "",
         reprojection_error=_mean_error(model),
     )
+
+
+def image_path(name: str, folder: Path, images: Path, names: Names) -> Path:
+    """The file of a model's image: in the folder of the images or, as some models have it, relative to the scene's."""
+    return names.find(images, name) or names.find(folder, name) or images / name
 
 
 def _points(model: SparseModel, sparse: Path) -> tuple[Points, str, tuple[Path, ...], tuple[str, ...]]:
