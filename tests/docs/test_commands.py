@@ -26,7 +26,14 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")))
 STEPS = 6
 # What needs data sets or several machines; and what tests/reconstruct and tests/compressing run.
-ELSEWHERE = ("--cluster", "mip_nerf_360", "benchmark captures", "compgs reconstruct", "compgs adjust", "compgs compress")
+ELSEWHERE = (
+    "--cluster",
+    "mip_nerf_360",
+    "benchmark captures",
+    "compgs reconstruct",
+    "compgs adjust",
+    "compgs compress",
+)
 
 
 def commands() -> list[tuple[str, str]]:
