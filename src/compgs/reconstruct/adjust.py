@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from compgs.errors import ConfigError, MissingSparseModel, SceneError
+from compgs.numerics.nearest import nearest
 from compgs.numerics.rotations import rotation_from_quaternion
 from compgs.occupied import occupied
 from compgs.outputs import check_output_folder, write_json
@@ -175,7 +175,7 @@ def carried(points: np.ndarray, there: np.ndarray, now: np.ndarray) -> np.ndarra
     """
     if len(there) == 0:
         return points
-    around = cKDTree(there).query(points, k=list(range(1, min(AROUND, len(there)) + 1)))[1]
+    _, around = nearest(there, points, min(AROUND, len(there)))
     return points + np.median((now - there)[around], axis=1)
 
 
