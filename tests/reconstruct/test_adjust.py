@@ -93,6 +93,7 @@ def test_the_capture_is_whole_and_says_what_was_done(adjusted: tuple[Path, Adjus
     model = read_sparse_model(result.scene / "sparse" / "0")
     assert told["points"] == result.points == len(model.points.positions) > 100
     assert {image.name for image in model.images} == set(walls.centers)
+    assert not any("adjustment.json" in note for note in load_scene(result.scene, holdout=False).notes)
     assert [camera.model for camera in model.cameras.values()] == ["PINHOLE"] * len(walls.centers)
     for name in walls.centers:
         assert (result.scene / "images" / name).read_bytes() == (source / "images" / name).read_bytes()

@@ -10,7 +10,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", 
 # Files about a capture, not of it, by the beginning of their names.
 ABOUT = ("license", "licence", "readme", "copying", "notice", "citation")
 # What `compgs reconstruct` and file managers leave.
-BYPRODUCTS = ("reconstruction.json", "reconstruction.png", "thumbs.db", "desktop.ini")
+BYPRODUCTS = ("reconstruction.json", "reconstruction.png", "adjustment.json", "thumbs.db", "desktop.ini")
 MOST_NAMED = 12
 FEW = 3  # files of one folder that are named one by one
 
