@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -117,6 +118,14 @@ def test_without_a_model_or_a_photograph_it_says_what_is_missing(walls: Walls, t
     with pytest.raises(SceneError, match=r"photo_3\.png.* is missing"):
         adjust(source, tmp_path / "scene")
     assert not (tmp_path / "scene").exists()
+
+
+def test_photographs_of_another_size_than_their_cameras_are_refused(walls: Walls, tmp_path: Path) -> None:
+    source = capture_of(walls, tmp_path / "given", wrong=0.0)
+    photograph = source / "images" / "photo_2.png"
+    Image.open(photograph).resize((200, 150)).save(photograph)
+    with pytest.raises(SceneError, match=r"photo_2\.png: is of 200 x 150 pixels, its camera of 400 x 300"):
+        adjust(source, tmp_path / "scene")
 
 
 def test_an_existing_capture_is_not_replaced_unasked(adjusted: tuple[Path, Adjusted]) -> None:

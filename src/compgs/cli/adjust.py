@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from compgs.cli.command import NO_DEFAULT, Command
+from compgs.cli.colmap_options import ColmapOptions
+from compgs.cli.command import Command
 from compgs.cli.console import say, warn
 from compgs.cli.reconstruct import MOST_NAMES, stages_shown
-from compgs.cli.usage import check_range, settings_of_options
+from compgs.cli.usage import settings_of_options
 from compgs.words import duration
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adjust(Command):
+class Adjust(Command, ColmapOptions):
     """Make the cameras of a COLMAP capture fit its photographs better (bundle adjustment), and write it anew.
 
     Worth trying on captures from elsewhere whose scenes stay soft: a camera that is off by a third of a pixel costs
@@ -39,24 +40,13 @@ class Adjust(Command):
     features: Annotated[int, arg(metavar="N")] = 6000
     """Most features of a photograph."""
 
-    feature_size: Annotated[int, arg(metavar="PIXELS")] = 1600
-    """Larger photographs are shrunk to this length of their longer side to find features."""
-
-    threads: Annotated[int | None, arg(metavar="N", help_behavior_hint=NO_DEFAULT)] = None
-    """Threads to use; all cores by default."""
-
-    seed: Annotated[int, arg(metavar="N")] = 0
-    """Seed of everything random."""
-
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace a capture that is in ADJUSTED already."""
 
     def run(self) -> None:
         from compgs.reconstruct import AdjustOptions, adjust
 
-        check_range("--seed", self.seed, 0, 2**31 - 1)
-        if self.threads is not None:
-            check_range("--threads", self.threads, 1, 1024)
+        self.check_colmap_options()
         options = AdjustOptions(self.features, self.feature_size, self.threads, self.seed)
         with settings_of_options(), stages_shown() as progress:
             result = adjust(self.capture, self.output, options, overwrite=self.overwrite, progress=progress)

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from compgs.cli.command import NO_DEFAULT, Command
+from compgs.cli.colmap_options import ColmapOptions
+from compgs.cli.command import Command
 from compgs.cli.console import console, say, warn
 from compgs.cli.progress import LINE_SECONDS, counting_lines
-from compgs.cli.usage import check_range, settings_of_options
+from compgs.cli.usage import settings_of_options
 from compgs.words import duration
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ MOST_NAMES = 5  # of photographs without a pose, that are listed
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reconstruct(Command):
+class Reconstruct(Command, ColmapOptions):
     """Find the poses of photographs, or of a video's frames, and write a scene that `compgs train` reads.
 
     Photographs should overlap by two thirds, be sharp, and show something with texture that stands still; 30 to 300
@@ -65,17 +66,8 @@ class Reconstruct(Command):
     features: Annotated[int, arg(metavar="N")] = 4096
     """Most features of a photograph; more help with fine texture, and take longer."""
 
-    feature_size: Annotated[int, arg(metavar="PIXELS")] = 1600
-    """Larger photographs are shrunk to this length of their longer side to find features."""
-
     undistort: FlagCreatePairsOff[bool] = False
     """Write images without lens distortion, for other programs; `compgs train` undistorts as it reads."""
-
-    threads: Annotated[int | None, arg(metavar="N", help_behavior_hint=NO_DEFAULT)] = None
-    """Threads to use; all cores by default."""
-
-    seed: Annotated[int, arg(metavar="N")] = 0
-    """Seed of everything random."""
 
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace a scene that is in SCENE already."""
@@ -83,9 +75,7 @@ class Reconstruct(Command):
     def run(self) -> None:
         from compgs.reconstruct import ReconstructOptions, reconstruct
 
-        check_range("--seed", self.seed, 0, 2**31 - 1)
-        if self.threads is not None:
-            check_range("--threads", self.threads, 1, 1024)
+        self.check_colmap_options()
         options = ReconstructOptions(
             matching=self.matching,
             overlap=self.overlap,

@@ -2,11 +2,10 @@
 
 Reconstructions of photographs whose lenses were undone before, each by an estimate of its own, can be off by half a
 pixel in parts of every photograph, and no scene is sharp that is trained on them (docs/results/truck.md). Here poses,
-focal lengths, principal points and distortions are fitted again, together with the points that features show.
+principal points and distortions are fitted again, together with the points that features show. Focal lengths stay.
 """
 
 import os
-import secrets
 import shutil
 import time
 from dataclasses import dataclass, replace
@@ -16,22 +15,18 @@ import numpy as np
 
 from compgs.errors import ConfigError, MissingSparseModel, SceneError
 from compgs.numerics.nearest import nearest
-from compgs.numerics.rotations import rotation_from_quaternion
-from compgs.occupied import occupied
-from compgs.outputs import check_output_folder, write_json
-from compgs.reconstruct.mapping import AdjustJob, Progress, adjust_cameras, check_colmap
-from compgs.reconstruct.photographs import is_upright
-from compgs.reconstruct.reconstruct import move_into_place
+from compgs.outputs import write_json
+from compgs.reconstruct.mapping import AdjustJob, Progress, adjust_cameras, check_colmap, silent
+from compgs.reconstruct.photographs import size_and_turn
+from compgs.reconstruct.report import camera_center, viewing_direction
+from compgs.reconstruct.scene_folder import new_scene
 from compgs.scene.colmap import SparseModel, find_sparse_model, model_files, read_sparse_model
 from compgs.scene.colmap_capture import image_path
 from compgs.scene.colmap_writer import write_sparse_model
 from compgs.scene.names import Names
 
-NEAR, WIDE, WIDE_EVERY = (
-    10,
-    50,
-    4,
-)  # a photograph is compared with its 10 nearest, and every 4th of the next 50
+# A photograph is compared with its 10 nearest, and every 4th of the next 50.
+NEAR, WIDE, WIDE_EVERY = 10, 50, 4
 AROUND = 12  # points of features that say how a given point moves
 MOST_TURNED = 0.9  # radians between viewing directions: photographs that differ more share few features
 LEFT_BEHIND = ("frames", "rigs", "project")  # files of COLMAP's beside a model, which no longer belong to it
@@ -42,9 +37,7 @@ class AdjustOptions:
     """How features are found."""
 
     features: int = 6000  # most of a photograph
-    feature_size: int = (
-        1600  # pixels of the longer side, beyond which photographs are shrunk to find features
-    )
+    feature_size: int = 1600  # pixels of the longer side: larger photographs are shrunk to find features
     threads: int | None = None
     seed: int = 0
 
@@ -78,8 +71,8 @@ def adjust(
     Photographs, masks and lists are linked, or copied where that is not possible. The world's frame stays: the cameras'
     centers lie as close to the former ones as a similarity brings them. The given points are carried along; where they
     are fewer than those of the features, these take their place.
-    Raises SceneError and its kinds where there is no COLMAP model or too little to adjust by, MissingDependency
-    without pycolmap, OutputError, ConfigError.
+    Raises SceneError and its kinds where there is no COLMAP model, or photographs are not those that it is of,
+    MissingDependency without pycolmap, OutputError, ConfigError.
     """
     options = options or AdjustOptions()
     for name in ("features", "feature_size"):
@@ -94,16 +87,8 @@ def adjust(
             f"{source}: has no COLMAP model (sparse/0), and only those are adjusted; photographs without poses get "
             f"theirs from: compgs reconstruct {source} -o SCENE"
         )
-    check_output_folder(scene, overwrite=overwrite)
-    work = scene.absolute().with_name(f".{scene.absolute().name}.{secrets.token_hex(8)}.partial")
-    with occupied(scene):
-        work.mkdir(parents=True)
-        try:
-            result = _adjust_in(work, source, sparse, scene, options, progress or _silent)
-            move_into_place(work / "scene", scene)
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
-    return result
+    with new_scene(scene, overwrite=overwrite) as work:
+        return _adjust_in(work, source, sparse, scene, options, progress or silent)
 
 
 def _adjust_in(
@@ -181,12 +166,12 @@ def carried(points: np.ndarray, there: np.ndarray, now: np.ndarray) -> np.ndarra
 
 def pairs_in_view(model: SparseModel) -> list[tuple[int, int]]:
     """Pairs of the model's images that may show the same, each once: near ones that look the same way."""
-    turns = np.stack([rotation_from_quaternion(image.quaternion) for image in model.images])
-    centers = np.stack([-turn.T @ image.translation for turn, image in zip(turns, model.images, strict=True)])
+    looks = np.stack([viewing_direction(image) for image in model.images])
+    centers = np.stack([camera_center(image) for image in model.images])
     reach = max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()), 1e-12)
     pairs = set()
     for first in range(len(centers)):
-        angle = np.arccos(np.clip(turns[:, 2] @ turns[first, 2], -1, 1))
+        angle = np.arccos(np.clip(looks @ looks[first], -1, 1))
         cost = np.linalg.norm(centers - centers[first], axis=1) / reach + angle
         cost[(angle > MOST_TURNED) | (np.arange(len(cost)) == first)] = np.inf
         order = np.argsort(cost, kind="stable")
@@ -203,7 +188,14 @@ def _photographs(folder: Path, source: Path, model: SparseModel) -> list[str]:
         path = image_path(image.name, source, source / "images", found)
         if not path.is_file():
             raise SceneError(f"{path}: the photograph of the model's image {image.name!r} is missing")
-        if not is_upright(path):
+        size, turned = size_and_turn(path)
+        camera = model.cameras[image.camera_id]
+        if size != (camera.width, camera.height):
+            raise SceneError(
+                f"{path}: is of {size[0]} x {size[1]} pixels, its camera of {camera.width} x {camera.height}; give "
+                "the photographs that the model was made of"
+            )
+        if turned:
             raise SceneError(
                 f"{path}: its orientation tag asks for a turn, and features are found in photographs as they are "
                 "stored; store it upright, or begin with compgs reconstruct"
@@ -235,7 +227,3 @@ def _link(source: str, target: str) -> None:
         os.link(os.path.realpath(source), target)
     except OSError:
         shutil.copyfile(source, target)
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    pass

@@ -1,10 +1,13 @@
 """Bundle adjustment of a capture that has cameras, in the process of `worker.py`."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from compgs.reconstruct.features import find_features
 
 FEW_SEEN = 50  # common points of a photograph, of which fewer hardly say where it is
 # Pixels: a point that is off by more is none of a photograph's, and says nothing of its camera; it may be off by more
@@ -15,7 +18,7 @@ MOST_STEPS = 150  # of a round: it ends earlier where nothing moves any more
 ROUNDS = 2  # with all points, and with those that fit
 
 
-def adjust(job: dict[str, Any], tell: Any) -> None:
+def adjust(job: dict[str, Any], tell: Callable[..., None]) -> None:
     """Find features, match them, triangulate them from the given cameras, then fit all. Writes the model to the folder
     `adjusted`, and beside the database `adjusted.json`, what came of it, and `moved.npz`, where points were and are.
     """
@@ -26,20 +29,8 @@ def adjust(job: dict[str, Any], tell: Any) -> None:
     given = pycolmap.Reconstruction(job["given"])
     threads = job["threads"] or -1
 
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.num_threads = threads
-    extraction.max_image_size = job["feature_size"]
-    extraction.sift.max_num_features = job["features"]
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "PINHOLE"  # until the given one takes its place
     tell("features")
-    pycolmap.extract_features(
-        database,
-        images,
-        camera_mode=pycolmap.CameraMode.PER_FOLDER,
-        reader_options=reader,
-        extraction_options=extraction,
-    )
+    find_features(job, "PER_FOLDER", "PINHOLE")  # a lens until the given ones take its place
     model = _given_cameras(database, given, job["names"])
 
     matching = pycolmap.FeatureMatchingOptions()
@@ -62,7 +53,7 @@ def adjust(job: dict[str, Any], tell: Any) -> None:
         _fit(model, threads)
         tell("round", done + 1)
     after = errors(model)
-    old = {name: given_image for given_image in given.images.values() for name in [given_image.name]}
+    old = {image.name: image for image in given.images.values()}
     real = {short: name for name, short in job["names"].items()}
     _bring_back(model, {image_id: old[real[image.name]] for image_id, image in model.images.items()})
     model.extract_colors_for_all_images(images)
@@ -98,11 +89,6 @@ def _given_cameras(database: Path, given: Any, names: dict[str, str]) -> Any:
         images = opened.read_all_images()
         for camera in opened.read_all_cameras():
             its = next(old[image.name] for image in images if image.camera_id == camera.camera_id).camera
-            if (its.width, its.height) != (camera.width, camera.height):
-                raise ValueError(
-                    f"the photographs are of {camera.width} x {camera.height} pixels, their camera of "
-                    f"{its.width} x {its.height}"
-                )
             camera.model, camera.params, camera.has_prior_focal_length = its.model, list(its.params), True
             opened.update_camera(camera)
             model.add_camera(camera)

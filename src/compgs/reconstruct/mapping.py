@@ -21,6 +21,11 @@ from compgs.reconstruct.retrieval import ALIKE, NEAR
 Stage = Literal["features", "matching", "mapping", "adjusting"]
 Progress = Callable[[Stage, int, int], None]  # stage, done, total
 
+
+def silent(stage: Stage, done: int, total: int) -> None:
+    """Say nothing of the progress."""
+
+
 LOOK_SECONDS = 1.0  # between two looks at how far a stage is
 TAIL = 3  # last lines of COLMAP's log that an error shows
 

@@ -65,11 +65,13 @@ def find_photographs(folder: Path) -> list[Photograph]:
     return photographs
 
 
-def is_upright(path: Path) -> bool:
-    """Whether a photograph is stored as it is to be seen. Raises UnreadableImage."""
+def size_and_turn(path: Path) -> tuple[tuple[int, int], bool]:
+    """(width, height) in pixels as a photograph is stored, and whether its orientation tag asks for a turn. Raises
+    UnreadableImage.
+    """
     try:
         with open_image(path) as image:
-            return image.getexif().get(ROTATED, 1) in (0, 1)
+            return image.size, image.getexif().get(ROTATED, 1) not in (0, 1)
     except DAMAGED as error:
         raise UnreadableImage(f"{path}: cannot be read ({error}); remove it or save it again") from error
 

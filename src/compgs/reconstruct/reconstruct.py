@@ -1,6 +1,5 @@
-"""From photographs to a scene: stages in order, and a folder that appears when all of it is there."""
+"""From photographs to a scene: the stages in order."""
 
-import secrets
 import shutil
 import time
 from collections.abc import Callable
@@ -11,11 +10,18 @@ from typing import Literal
 from PIL import Image
 
 from compgs.errors import ConfigError, SceneError
-from compgs.occupied import occupied
-from compgs.outputs import check_output_folder, write_json
+from compgs.outputs import write_json
 from compgs.reconstruct import video
 from compgs.reconstruct.cameras import SharedCamera, lens_model, shared_camera
-from compgs.reconstruct.mapping import Job, Progress, Stage, check_colmap, run_colmap, undistort_images
+from compgs.reconstruct.mapping import (
+    Job,
+    Progress,
+    Stage,
+    check_colmap,
+    run_colmap,
+    silent,
+    undistort_images,
+)
 from compgs.reconstruct.photographs import (
     JPEG_QUALITY,
     Photograph,
@@ -25,6 +31,7 @@ from compgs.reconstruct.photographs import (
 )
 from compgs.reconstruct.reconstruction import Reconstruction
 from compgs.reconstruct.report import picture, summary
+from compgs.reconstruct.scene_folder import new_scene
 from compgs.scene.colmap import SparseModel, read_sparse_model
 from compgs.scene.masks import FOLDER as MASKS
 
@@ -70,29 +77,10 @@ def reconstruct(
     check_colmap()
     if not source.exists():
         raise SceneError(f"{source}: does not exist; expected a folder of photographs, or a video")
-    check_output_folder(scene, overwrite=overwrite)
-    work = scene.absolute().with_name(f".{scene.absolute().name}.{secrets.token_hex(8)}.partial")
-    with occupied(scene):
-        return _reconstruct_in(work, source, scene, options, progress, note)
-
-
-def _reconstruct_in(
-    work: Path,
-    source: Path,
-    scene: Path,
-    options: ReconstructOptions,
-    progress: Progress | None,
-    note: Callable[[str], None] | None,
-) -> Reconstruction:
-    """Reconstruct in a folder for what is made on the way, which is not there yet and goes again."""
-    work.mkdir(parents=True)
-    try:
-        result = _reconstruct(source, scene, work, options, _Clock(progress or _silent))
+    with new_scene(scene, overwrite=overwrite) as work:
+        result = _reconstruct(source, scene, work, options, _Clock(progress or silent))
         if note is not None and result.matching == "exhaustive" and result.photographs > EXHAUSTIVE_UP_TO:
             note("every pair of photographs was compared; --matching retrieval is faster")
-        move_into_place(work / "scene", scene)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     return result
 
 
@@ -223,15 +211,6 @@ def _undistorted(target: Path, model: Path, place: Path) -> Path:
     return place / "sparse"
 
 
-def move_into_place(new: Path, scene: Path) -> None:
-    """An earlier folder stays until the new one takes its place."""
-    earlier = new.with_name("earlier")
-    if scene.exists():
-        scene.rename(earlier)
-    scene.parent.mkdir(parents=True, exist_ok=True)
-    new.rename(scene)
-
-
 class _Clock:
     """Passes progress on, and takes the time of each stage."""
 
@@ -247,7 +226,3 @@ class _Clock:
         """Seconds of each stage, the last of which ends now."""
         times = [*self.began.values(), time.monotonic()]
         return {stage: times[i + 1] - times[i] for i, stage in enumerate(self.began)}
-
-
-def _silent(stage: Stage, done: int, total: int) -> None:
-    pass

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from compgs.reconstruct.adjusting import adjust
+from compgs.reconstruct.features import find_features
 
 
 def main() -> None:
@@ -32,18 +33,9 @@ def find_poses(job: dict[str, Any]) -> None:
     database, images = Path(job["database"]), Path(job["images"])
     threads = job["threads"] or -1
 
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.num_threads = threads
-    extraction.max_image_size = job["feature_size"]
-    extraction.sift.max_num_features = job["features"]
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = job["lens"]
     modes = {"one": "SINGLE", "folder": "PER_FOLDER", "each": "PER_IMAGE"}
-    mode = getattr(pycolmap.CameraMode, modes[job["shared"]])
     _tell("features")
-    pycolmap.extract_features(
-        database, images, camera_mode=mode, reader_options=reader, extraction_options=extraction
-    )
+    find_features(job, modes[job["shared"]], job["lens"])
 
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = threads

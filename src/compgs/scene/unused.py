@@ -9,7 +9,7 @@ from compgs.scene.colmap import count_images
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".jp2")
 # Files about a capture, not of it, by the beginning of their names.
 ABOUT = ("license", "licence", "readme", "copying", "notice", "citation")
-# What `compgs reconstruct` and file managers leave.
+# What `compgs reconstruct`, `compgs adjust` and file managers leave.
 BYPRODUCTS = ("reconstruction.json", "reconstruction.png", "adjustment.json", "thumbs.db", "desktop.ini")
 MOST_NAMED = 12
 FEW = 3  # files of one folder that are named one by one
