@@ -54,7 +54,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What somebody who follows the documentation has after a while."""
     folder = tmp_path_factory.mktemp("world")
     generate_scene(folder / "scenes" / "garden", views=9, width=48, height=36)
-    shutil.copytree(folder / "scenes" / "garden", folder / "scenes" / "city")
+    for copy in ("city", "garden_adjusted"):
+        shutil.copytree(folder / "scenes" / "garden", folder / "scenes" / copy)
     patch = pytest.MonkeyPatch()
     patch.chdir(folder)
     shorten(patch)
