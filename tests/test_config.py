@@ -183,6 +183,17 @@ def test_the_control_of_earlier_versions_is_one_of_the_variants() -> None:
         config_from_dict({"control": {"opacity_views": 7}})
 
 
+def test_a_run_that_left_out_a_former_rule_is_read_without_it() -> None:
+    for rules, today in (
+        ("all but sampled_gradients", "all"),
+        ("all but sampled_gradients, hidden_anchors", "all"),
+        ("all but dropout, hidden_anchors", "all but dropout"),
+        ("all but dropout", "all but dropout"),
+        ("none", "none"),
+    ):
+        assert config_from_dict({"training": {"rules": rules}}).training.rules == today
+
+
 def test_rules_that_former_settings_name_are_there() -> None:
     named = {rule for former in FORMER.values() for rule in re.findall(r"all but ([^']+)'", former.instead)}
     known = {rule.name for rule in RULES}

@@ -51,8 +51,6 @@ CONFIG = Config(
         steps=60,
         seed=11,
         target_bytes=2_200,
-        # Which gradients are in a sample depends on the last bit of all before them.
-        rules="all but sampled_gradients",
         phases=Phases(rate=0.05, symbols=0.75),
     ),
 )

@@ -63,8 +63,8 @@ FORMER = {
     "training.left_out": _of_rule(0.2, 0.0, "dropout"),
     "training.coarse_until": _of_rule(0.7, 0.0, "coarse_photographs"),
     "training.rate_every": _of_rule(4, 1, "rate_every"),
-    "training.sampled_gradients": _of_rule(0.1, 0.0, "sampled_gradients"),
-    "training.passed_over": _of_rule(0.03, 0.0, "hidden_anchors"),
+    "training.sampled_gradients": Former(None, "all gradients go on"),
+    "training.passed_over": Former(None, "all anchors in view are rendered"),
     "training.translation_lr": _of_heads(2e-3, 2e-5),
     "training.covariance_lr": _of_heads(4e-3, 4e-5),
     "training.opacity_lr": _of_heads(2e-3, 2e-5),
@@ -90,6 +90,10 @@ FORMER = {
     "entropy.residual_step": _of_steps(),
     "entropy.covariance_step": _of_steps(),
 }
+# Former rules, which saved time and changed nothing else: a run that left one out is what every run is now.
+FORMER_RULES = ("sampled_gradients", "hidden_anchors")
+# What they decided, in the plan of a run.
+FORMER_DECISIONS = ("sampled_gradients", "passed_over")
 # The former settings of `training` that `training.phases` holds now, in its order, with their defaults.
 PHASES = {
     "head_warm_up": 0.05,
@@ -151,6 +155,7 @@ def without_former(values: Mapping[str, Any], place: str) -> dict[str, Any]:
         _gather_steps(entropy)
         _leave_width(entropy, sections.get("model"), place)
     if isinstance(training, dict):
+        _leave_rules(training)
         _gather_phases(training)
         _leave_entropy_steps(training, control, place)
         if isinstance(sections.get("anchors"), dict):
@@ -194,6 +199,14 @@ def _gather_phases(training: dict[str, Any]) -> None:
     if said:
         *borders, averaged = {**PHASES, **said}.values()
         training.setdefault("phases", [*borders, 1.0 - averaged])
+
+
+def _leave_rules(training: dict[str, Any]) -> None:
+    """Take former rules from those that a run goes without."""
+    said, but, names = str(training.get("rules", "")).partition("all but ")
+    if not said and but:
+        left = [name for name in map(str.strip, names.split(",")) if name not in FORMER_RULES]
+        training["rules"] = but + ", ".join(left) if left else "all"
 
 
 def _gather_steps(entropy: dict[str, Any]) -> None:

@@ -252,6 +252,8 @@ class TrainedModel(nn.Module):
         stored_weights: bool = True,
         mask: Tensor
         | None = None,  # [V, K] bool: coupled primitives of these anchors whose bits count; default all
+        sample: Tensor
+        | None = None,  # [S] int64: of these anchors, those whose `neighbour_bits` count; default all
     ) -> Quantized:
         """Quantized latents (in steps) and their bits; see EntropyModel.forward."""
 
@@ -260,6 +262,7 @@ class TrainedModel(nn.Module):
 
         e = self.config.entropy
         stored = self.weights if stored_weights else None
+        beside = rows if sample is None else sample if rows is None else rows.index_select(0, sample)
         references = chosen(self.references)
         covariances = chosen(self.log_scales) / self.entropy.covariance_step
         residuals = self.residual_kind.of_anchors(self.residuals, rows, stored)
@@ -271,7 +274,8 @@ class TrainedModel(nn.Module):
             noise=noise,
             network_bits=stored.network if stored else None,
             mask=mask,
-            around=self.around(rows, decoded=noise is None) if rate else None,
+            around=self.around(beside, decoded=noise is None) if rate else None,
+            sample=sample,
         )
         if e.quantized:
             return latents

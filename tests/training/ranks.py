@@ -41,7 +41,6 @@ CONFIG = Config(
         seed=3,
         views_per_step=2,
         exposure=True,
-        rules="all but sampled_gradients",
         phases=Phases(rate=0.0),
     ),
 )

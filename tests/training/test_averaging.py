@@ -95,3 +95,16 @@ def test_a_mean_of_other_parameters_is_refused() -> None:
         average.restore({"average/weight": torch.zeros(2, 2)}, {"averaged": 1})
     with pytest.raises(ValueError, match="average weight"):
         average.restore({"average/weight": torch.zeros(3, 2)}, {"averaged": 1})
+
+
+def test_a_run_that_has_ended_ends_the_same_when_it_is_ended_again(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    """A run that is resumed after its last step, as its file was not written, ends once more."""
+    trainer = Trainer(blob_scene, settings(tiny_config, phases=Phases(mean=0.8)), CPU)
+    steps_of(trainer, tiny_config.training.steps)
+    trainer.finish()
+    once, mask = parameters(trainer), trainer.model.mask.clone()
+    trainer.finish()
+    assert torch.equal(trainer.model.mask, mask)
+    assert all(torch.equal(value, once[name]) for name, value in parameters(trainer).items())

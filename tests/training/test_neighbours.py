@@ -55,7 +55,7 @@ def test_the_network_of_the_neighbours_learns_and_latents_do_not_learn_from_it(
     before = {name: p.detach().clone() for name, p in network.named_parameters()}
     trainer.step = 12  # the rate is in the loss
     now = trainer.now
-    looks = trainer.views_of_step(now)
+    looks = trainer.views_of_step()
     trainer.learn(looks, now)
     gradients = trainer.model.references.grad
     assert gradients is not None and network.follow.grad is not None
@@ -114,3 +114,28 @@ def test_without_some_primitives_the_others_stay_what_they_are(trained: Trainer)
         assert np.array_equal(before[were], after)
     references = smaller.group(Role.REFERENCE).symbols
     assert not np.array_equal(content.group(Role.REFERENCE).symbols[were], references)
+
+
+def test_the_network_of_the_neighbours_learns_of_an_even_sample_where_anchors_are_many(
+    scene: Scene, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it learns of is some of what all anchors would say, whatever else the step does."""
+    found = []
+    for most in (1 << 20, 20):
+        monkeypatch.setattr("compgs.training.step.latents.LEARNED_FROM", most)
+        trainer = Trainer(scene, config, CPU)
+        trainer.step = 24  # symbols are in the likelihood: no noise
+        now, looks = trainer.now, trainer.views_of_step()
+        assert now.hard and now.rate_weight
+        latents = trainer.latents.quantize(looks, now)
+        found.append((looks, latents, trainer.latents.sample_of(looks)))
+        trainer.latents.learn_neighbours(latents, looks)
+        network = trainer.model.entropy.neighbour_network
+        assert network is not None and network.follow.grad is not None and network.follow.grad.abs().max() > 0
+    (looks, all_of_them, everything), (_, some, sample) = found
+    assert everything is None and sample is not None
+    assert len(looks.own.rows) / 2 > len(sample) > 10 and len(sample) <= 20
+    assert all_of_them.neighbour_bits is not None and some.neighbour_bits is not None
+    torch.testing.assert_close(some.neighbour_bits, all_of_them.neighbour_bits[sample])
+    for name, bits in all_of_them.bits.items():
+        assert torch.equal(bits, some.bits[name])

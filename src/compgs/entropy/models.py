@@ -40,7 +40,7 @@ class Quantized:
     covariances: Tensor  # [N, 6]
     residuals: Tensor  # [N, K * residual_dim]
     bits: dict[str, Tensor]  # stream -> [N] bits per anchor, as training pays for; empty when not asked for
-    # [N] of the references in the file, if they are coded around neighbours
+    # [N] of the references in the file, if they are coded around neighbours; [S] of a sample, if that was asked for
     neighbour_bits: Tensor | None = None
 
     @property
@@ -61,13 +61,12 @@ class Quantized:
         return Quantized(references, covariances, residuals, {})
 
     def of(self, part: Tensor | None) -> "Quantized":
-        """Return the rows `part` [V] int64; None: all of them."""
+        """Return the rows `part` [V] int64, without `neighbour_bits`; None: everything."""
         if part is None:
             return self
         references, covariances, residuals = (latent.index_select(0, part) for latent in self.latents())
         bits = {name: of_stream.index_select(0, part) for name, of_stream in self.bits.items()}
-        beside = None if self.neighbour_bits is None else self.neighbour_bits.index_select(0, part)
-        return Quantized(references, covariances, residuals, bits, beside)
+        return Quantized(references, covariances, residuals, bits)
 
 
 class EntropyModel(nn.Module):
@@ -187,8 +186,9 @@ class EntropyModel(nn.Module):
         noise: Callable[[Tensor], Tensor] | None = None,
         network_bits: int | None = None,
         mask: Tensor | None = None,  # [N, K] bool: coupled primitives that are coded; default all
-        # [N, 2 + reference_dim] `Neighbourhood.around`, if references see neighbours and `rate`
+        # [S, 2 + reference_dim] `Neighbourhood.around`, if references see neighbours and `rate`
         around: Tensor | None = None,
+        sample: Tensor | None = None,  # [S] int64: the anchors that `around` is of; None: all N
     ) -> Quantized:
         """Quantize, and estimate the bits if `rate`.
 
@@ -204,7 +204,7 @@ class EntropyModel(nn.Module):
             bits = {**(self.reference_context.bits(z, noise) if rate else {}), "reference": bits_f}
         if neighbours is not None:
             f_hat, bits_n = neighbours.code(
-                references, around, code, rate=rate, noise=noise, bits=network_bits
+                references, around, sample, code, rate=rate, noise=noise, bits=network_bits
             )
         c_hat, bits["covariance"] = code(covariances, f_hat, self.covariance_network)
         g_hat, bits_g = self.code_residuals(residuals, f_hat, code, rate=rate, noise=noise, mask=mask)

@@ -46,20 +46,22 @@ class NeighbourNetwork(EntropyNetwork):
     def code(
         self,
         y: Tensor,  # [N, C]
-        around: Tensor | None,  # [N, 2 + C] `Neighbourhood.around`
+        around: Tensor | None,  # [S, 2 + C] `Neighbourhood.around`
+        sample: Tensor | None,  # [S] int64: the anchors that `around` is of; None: all N
         code: Callable[..., tuple[Tensor, Tensor]],  # `code_latents` with what a whole step has in common
         *,
         rate: bool,
         noise: Callable[[Tensor], Tensor] | None,
         bits: int | None,
     ) -> tuple[Tensor, Tensor | None]:
-        """y_hat [N, C], and bits [N] of which only this network learns; None if not `rate`."""
+        """y_hat [N, C], and bits [S] of which only this network learns; None if not `rate`."""
         centre = self.centre if bits is None else round_fixed(self.centre)
         if not rate:
             return quantize(y, centre), None
         assert around is not None
         moved = self.moved(around, bits, whole=noise is None)
-        return quantize(y, centre), code(y.detach() - moved, around, self)[1]
+        known = y.detach() if sample is None else y.detach().index_select(0, sample)
+        return quantize(y, centre), code(known - moved, around, self)[1]
 
     @property
     def per_channel(self) -> tuple[nn.Parameter, ...]:

@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from compgs.config import MAX_VIEWPOINTS, MOST_COUPLED, Config, ModelConfig
 from compgs.errors import ConfigError
+from compgs.former_settings import FORMER_DECISIONS
 from compgs.render.settings import LEAST_DILATION
 
 # lambda for which the settings of growth are given, and the range in which it follows lambda: below 1e-6 more anchors
@@ -49,11 +50,6 @@ FEW_VIEWS_DROPOUT, FEW_VIEWS_DISCOUNT = 0.2, 0.5
 COARSE_PIXELS, COARSE_UNTIL = 160_000, 0.7
 # Steps from one with the rate to the next: latents change little meanwhile, and a step without takes a sixth less time.
 RATE_EVERY = 4
-# Of the mean gradient of a view's primitives: of smaller ones only a sample goes on. With 1 steps are faster still, and
-# the scene loses detail.
-SAMPLED_GRADIENTS = 0.1
-# Of the mean gradient: anchors whose primitives have less are passed over.
-PASSED_OVER = 0.03
 
 
 @dataclass(frozen=True)
@@ -267,20 +263,6 @@ RULES: tuple[Rule, ...] = (
         "results/decisions.md",
     ),
     Rule(
-        "sampled_gradients", "sampled_gradients", lambda c, s, share: SAMPLED_GRADIENTS,
-        "on the CPU",
-        lambda s: s.device == "cpu",
-        "results/decisions.md",
-    ),
-    # Several processes must look at the same anchors, and each would know of its own views alone.
-    Rule(
-        "hidden_anchors", "passed_over",
-        lambda c, s, share: PASSED_OVER if in_force("sampled_gradients", c) else 0.0,
-        "on the CPU in one process, where gradients are sampled",
-        lambda s: s.device == "cpu" and s.processes == 1,
-        "results/decisions.md",
-    ),
-    Rule(
         "poses", "poses", lambda c, s, learned: c.training.learns_poses(in_doubt=True),
         "a reconstruction whose mean error is above a pixel, or frames of a video",
         lambda s: s.poses_in_doubt,
@@ -312,8 +294,6 @@ class Plan:
     # shortcuts, which save time
     coarse_until: float  # share of the run in which large photographs are halved; 0: none
     rate_every: int  # steps between two with the rate in the loss
-    sampled_gradients: float  # of the mean gradient: of smaller ones a sample goes on; 0: all do
-    passed_over: float  # of the mean gradient: anchors that showed less are passed over; 0: none are
     start: Start
     reasons: Mapping[str, str] = field(default_factory=dict)  # by field, of those that a rule has set
     # of the photographs, between two points that are found in them before the run (`compgs.stereo`); 0: none are
@@ -342,7 +322,7 @@ class Plan:
     def from_dict(cls, values: Any) -> "Plan":
         """Inverse of `to_dict`. Raises ValueError for what is no plan."""
         try:
-            fields = dict(values)
+            fields = {name: value for name, value in dict(values).items() if name not in FORMER_DECISIONS}
             start, reasons = Start(**fields["start"]), {str(k): str(v) for k, v in fields["reasons"].items()}
             plan = cls(**{**fields, "start": start, "reasons": reasons})
         except (TypeError, KeyError, AttributeError) as error:
@@ -468,8 +448,6 @@ def _by_settings(config: Config, start: Start) -> dict[str, Any]:
         "dropout": 0.0,
         "coarse_until": 0.0,
         "rate_every": 1,
-        "sampled_gradients": 0.0,
-        "passed_over": 0.0,
         "dense_points": 0.0,
         "poses": config.training.poses == "on",
     }
@@ -511,8 +489,6 @@ def _expected(plan: Plan) -> dict[str, tuple[bool, str]]:
         "bit_discount": number("bit_discount", 1.0),
         "dropout": number("dropout", 0.5),
         "coarse_until": number("coarse_until", 1.0),
-        "sampled_gradients": number("sampled_gradients", 100.0),
-        "passed_over": number("passed_over", 1.0),
         "dense_points": number("dense_points", 1e4),
         "poses": one_of("poses", True, False),
     }

@@ -3,10 +3,8 @@
 | file | saves |
 |---|---|
 | `coarse` | pixels: large photographs are halved until details are due |
-| `hidden` | anchors: those that stood behind others when a view last looked are passed over |
-| `gradient_sampling` | gradients: of the small ones a sample goes on through the networks |
 | `rare_rate` | bits: the rate is in the loss of every few steps, as many times |
 
-The rules of `compgs.training.plan` are the one gate: each has a name there (`coarse_photographs`, `hidden_anchors`,
-`sampled_gradients`, `rate_every`), by which `training.rules` leaves it out.
+The rules of `compgs.training.plan` are the one gate: each has a name there (`coarse_photographs`, `rate_every`), by
+which `training.rules` leaves it out.
 """

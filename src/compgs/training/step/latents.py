@@ -17,6 +17,10 @@ from compgs.trained_model import TrainedModel
 from compgs.training.step.moment import Moment
 from compgs.training.step.step_views import StepViews
 
+# Anchors of a step that the neighbours' network learns from at most. It has a hundred weights; what around them has
+# would take an eighth of a step's time where 100 000 are in view.
+LEARNED_FROM = 16_384
+
 
 class StepLatents:
     """Quantization, rate, and the gradients that go through both (CompGS Sec. 3.3)."""
@@ -33,7 +37,19 @@ class StepLatents:
             rate=now.rate_weight > 0,
             noise=None if now.hard else views.noise_of_latents(),
             stored_weights=now.stored,
+            sample=self.sample_of(views),
         )
+
+    def sample_of(self, views: StepViews) -> Tensor | None:
+        """[S] int64 the anchors of a step that the neighbours' network learns from, evenly spread over those in view;
+        None: all.
+        """
+        count = len(views.own.rows)
+        apart = -(-count // LEARNED_FROM)
+        if apart <= 1:
+            return None
+        first = views.views[0] % apart  # other views begin elsewhere
+        return torch.arange(first, count, apart, device=views.own.rows.device)
 
     def rate_of(self, latents: Quantized, views: StepViews, now: Moment) -> Tensor | None:
         """R of Eq. 1, summed over this rank's views, and over the steps that it stands for; None where it is not in the
@@ -65,8 +81,13 @@ class StepLatents:
         """
         if latents.neighbour_bits is None:
             return
-        parts = [latents.of(views.own.part_of(number)).neighbour_bits for number in views.own.numbers]
-        torch.stack([bits.mean() for bits in parts if bits is not None]).sum().backward()
+        bits, numbers = latents.neighbour_bits, views.own.numbers
+        if len(bits) < len(latents.references):  # of a sample
+            parts = [bits] * len(numbers)
+        else:
+            chosen = [views.own.part_of(number) for number in numbers]
+            parts = [bits if part is None else bits.index_select(0, part) for part in chosen]
+        torch.stack([bits.mean() for bits in parts]).sum().backward()
 
 
 def pass_gradients_back(

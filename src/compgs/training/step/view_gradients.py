@@ -21,8 +21,6 @@ from compgs.trained_model import TrainedModel
 from compgs.training.plan import Plan
 from compgs.training.run.status import StepResult
 from compgs.training.shortcuts.coarse import CoarseViews
-from compgs.training.shortcuts.gradient_sampling import GradientSizes, with_sampled_gradients
-from compgs.training.shortcuts.hidden import HiddenAnchors
 from compgs.training.step.dropout import thinned
 from compgs.training.step.latents import pass_gradients_back
 from compgs.training.step.moment import Moment
@@ -42,7 +40,6 @@ class ViewGradients:
     plan: Plan
     pictures: Pictures
     coarse: CoarseViews
-    hidden: HiddenAnchors
     control: AdaptiveControl
 
     def learn(self, shown: Quantized, views: StepViews, now: Moment) -> list[StepResult]:
@@ -81,10 +78,8 @@ class ViewGradients:
         rows = views.own.rows_of(number)
         if geometry is not None:
             geometry = geometry.of(None if part is None else self.model.slots(part))
-        sizes = GradientSizes()
-        prediction, gaussians = self.predict(
-            shown.of(part), rows, camera, now, views.noise_of_view(number), geometry, sizes
-        )
+        noise = views.noise_of_view(number)
+        prediction, gaussians = self.predict(shown.of(part), rows, camera, now, noise, geometry)
         learned = self.coarse.views
         rendered = self.pictures.rasterize(
             learned.posed(view, gaussians, camera), camera, watched=now.watched
@@ -93,7 +88,6 @@ class ViewGradients:
         loss = self.pictures.compare(rendered, photograph) + self.regularize(prediction, gaussians, camera)
         self.pictures.backward(loss, rendered, gaussians)
         self.observe(rows, prediction, rendered, camera, now)
-        self.hidden.observe(view, rows, prediction, gaussians, sizes)
         return StepResult(loss.detach(), rendered.image.detach(), photograph)
 
     def predict(
@@ -104,14 +98,10 @@ class ViewGradients:
         now: Moment,
         noise: Noise,
         geometry: Geometry | None,
-        sizes: GradientSizes,
     ) -> tuple[Prediction, Gaussians]:
-        """What the view may show (Sec. 3.2), and its Gaussians without those that chance leaves out of this step.
-        `sizes` is filled by the backward pass with each Gaussian's size of gradient.
-        """
+        """What the view may show (Sec. 3.2), and its Gaussians without those that chance leaves out of this step."""
         prediction = predict_view(self.model, latents, rows, camera, stored=now.stored, geometry=geometry)
-        gaussians = thinned(prediction, self.plan.dropout, noise)
-        return prediction, with_sampled_gradients(gaussians, self.plan.sampled_gradients, noise, sizes)
+        return prediction, thinned(prediction, self.plan.dropout, noise)
 
     def regularize(self, prediction: Prediction, gaussians: Gaussians, camera: Camera) -> Tensor:
         """[] the part of the distortion beside the image's: penalties on large primitives and on a vanishing scene."""
