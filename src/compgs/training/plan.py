@@ -100,9 +100,10 @@ class Start:
     def in_words(self) -> str:
         """One line for people."""
         return (
-            f"{self.anchors:,} anchors, {self.views} training views, a point is in {self.sightings:g} of them, "
-            f"{self.passes:.1f} passes, lambda {self.lmbda:.3g}, photographs of up to {self.pixels:,} pixels, "
-            f"on {self.device}" + (f" ({self.processes} processes)" if self.processes > 1 else "")
+            f"{self.anchors:,} anchors at the given points, {self.views} training views, a point is in "
+            f"{self.sightings:g} of them, {self.passes:.1f} passes, lambda {self.lmbda:.3g}, photographs of up to "
+            f"{self.pixels:,} pixels, on {self.device}"
+            + (f" ({self.processes} processes)" if self.processes > 1 else "")
         )
 
 
