@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from compgs.cli.console import say
 from compgs.cli.main import main
 from compgs.codec.reader import file_info
 
@@ -77,6 +78,12 @@ def test_quiet_says_nothing_but_what_is_wrong(capsys: pytest.CaptureFixture[str]
     assert capsys.readouterr() == ("", "error: nowhere.cgs: there is no such file\n")
     assert main(["info", str(GOLDEN_FILE)]) == 0
     assert capsys.readouterr().out.startswith(str(GOLDEN_FILE))
+
+
+def test_a_quiet_command_leaves_others_as_loud_as_they_were(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(GOLDEN_FILE), "--quiet"]) == 0
+    say("heard")
+    assert capsys.readouterr().out == "heard\n"
 
 
 def test_info_as_json_has_the_files_bytes(capsys: pytest.CaptureFixture[str]) -> None:

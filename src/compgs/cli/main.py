@@ -136,6 +136,8 @@ def run(command: Command, words: Sequence[str]) -> int:
         with held_back():
             errors.print(escape(str(stop) or "interrupted"))
         return 143 if isinstance(stop, Terminated) else 130
+    finally:
+        speak()  # whoever calls `main` from Python may say something afterwards
     return 0
 
 
