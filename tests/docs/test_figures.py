@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from compgs.config import load_config
+from compgs.former_settings import FORMER_DECISIONS
 from compgs.training.plan import Start, plan
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,7 +40,8 @@ def test_readme_has_no_figure_of_quality_or_size_but_those_of_records() -> None:
 
 def test_readme_is_two_screens() -> None:
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    assert len(lines) <= 120 and max(map(len, lines)) <= 120
+    prose = [line for line in lines if not line.startswith("|")]  # rows of tables are laid out anew
+    assert len(lines) <= 120 and max(map(len, prose)) <= 120
 
 
 @pytest.mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
@@ -54,7 +56,7 @@ def test_a_row_names_its_commit_exactly_if_the_preset_of_today_would_train_other
         record["plan"].get(name, 0) == value
         for name, value in now.items()
         if name not in ("start", "reasons")
-    )
+    ) and not any(record["plan"].get(name) for name in FORMER_DECISIONS)
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert (f"{record['page']}), at {record['commit']} |" in readme) == (not same)
 
