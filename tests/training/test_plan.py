@@ -30,6 +30,7 @@ from compgs.training.start import plan_for, start_of
 
 DOCS = Path(__file__).parents[2] / "docs"
 LAMBDAS = [0.0, *(10 ** (n / 8) for n in range(-64, 9))]
+ROOT = Path(__file__).parents[2]
 USUAL = Start(5000, 80, 60.0, 30.0, 0.002, 86_400, "cpu")
 STARTS = [
     replace(
@@ -99,7 +100,11 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         assert 1 / 5 < lambda_for(size / 6423) / lmbda < 5
         expected = expected_bytes(replace(USUAL, anchors=6423, lmbda=lmbda))
         assert expected is not None and 1 / 3 < expected / size < 3
-    assert expected_bytes(replace(USUAL, anchors=500_000)) is None
+    for record in ("truck", "truck_adjusted", "bonsai"):
+        run = json.loads((ROOT / f"docs/results/records/{record}.json").read_text(encoding="utf-8"))
+        expected = expected_bytes(Start(**run["plan"]["start"]))
+        assert expected is not None and 1 / 2 < expected / run["results"]["bytes"] < 2
+    assert expected_bytes(replace(USUAL, anchors=200_001)) is None
     assert expected_bytes(replace(USUAL, lmbda=0.0)) is None
 
 

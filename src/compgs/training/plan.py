@@ -26,8 +26,9 @@ from compgs.render.settings import LEAST_DILATION
 USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 # A file of b bytes for each anchor of the beginning comes of a lambda of about 0.04 / b^1.5: fitted to the default
 # preset's curves of docs/results (plush and brighton, 1 500 and 5 000 steps, lambda 0.0001 to 0.1). Sizes are met
-# within a factor of 2 (one standard deviation), at worst 3.5.
+# within a factor of 2 (one standard deviation), at worst 3.5; those of Truck (93 431 anchors) and Bonsai within 1.6.
 ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 1.5
+SIZED_ANCHORS = 1_000, 200_000  # of the beginning, between which that is taken to hold
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
 # two bits of an anchor there, which has a hundred and more. More hidden units do not pay even there.
 MANY_ANCHORS = 20_000
@@ -394,8 +395,8 @@ def lambda_for(bytes_per_anchor: float) -> float:
 
 def expected_bytes(start: Start) -> float | None:
     """Bytes of the file, about: the inverse of `lambda_for`. None where it is not known."""
-    # From some thousand anchors of the beginning on, until they are many, the line is known to hold.
-    if start.lmbda <= 0 or not 1_000 <= start.anchors <= MANY_ANCHORS:
+    fewest, most = SIZED_ANCHORS
+    if start.lmbda <= 0 or not fewest <= start.anchors <= most:
         return None
     return start.anchors * (ONE_BYTE_LAMBDA / start.lmbda) ** (1 / SIZE_EXPONENT)
 
