@@ -55,7 +55,7 @@ def test_the_network_of_the_neighbours_learns_and_latents_do_not_learn_from_it(
     before = {name: p.detach().clone() for name, p in network.named_parameters()}
     trainer.step = 12  # the rate is in the loss
     now = trainer.now
-    looks = trainer.views_of_step()
+    looks = trainer.views_of_step(now)
     trainer.learn(looks, now)
     gradients = trainer.model.references.grad
     assert gradients is not None and network.follow.grad is not None
@@ -125,7 +125,8 @@ def test_the_network_of_the_neighbours_learns_of_an_even_sample_where_anchors_ar
         monkeypatch.setattr("compgs.training.step.latents.LEARNED_FROM", most)
         trainer = Trainer(scene, config, CPU)
         trainer.step = 24  # symbols are in the likelihood: no noise
-        now, looks = trainer.now, trainer.views_of_step()
+        now = trainer.now
+        looks = trainer.views_of_step(now)
         assert now.hard and now.rate_weight
         latents = trainer.latents.quantize(looks, now)
         found.append((looks, latents, trainer.latents.sample_of(looks)))

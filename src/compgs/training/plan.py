@@ -51,6 +51,8 @@ FEW_VIEWS_DROPOUT, FEW_VIEWS_DISCOUNT = 0.2, 0.5
 COARSE_PIXELS, COARSE_UNTIL = 160_000, 0.7
 # Steps from one with the rate to the next: latents change little meanwhile, and a step without takes a sixth less time.
 RATE_EVERY = 4
+# Of the mean gradient of a view's primitives: anchors whose primitives have less are passed over.
+PASSED_OVER = 0.03
 
 
 @dataclass(frozen=True)
@@ -264,6 +266,13 @@ RULES: tuple[Rule, ...] = (
         lambda s: True,
         "results/decisions.md",
     ),
+    # Several processes must look at the same anchors, and each would know of its own views alone.
+    Rule(
+        "hidden_anchors", "passed_over", lambda c, s, share: PASSED_OVER,
+        "on the CPU in one process",
+        lambda s: s.device == "cpu" and s.processes == 1,
+        "results/decisions.md",
+    ),
     Rule(
         "poses", "poses", lambda c, s, learned: c.training.learns_poses(in_doubt=True),
         "a reconstruction whose mean error is above a pixel, or frames of a video",
@@ -296,6 +305,7 @@ class Plan:
     # shortcuts, which save time
     coarse_until: float  # share of the run in which large photographs are halved; 0: none
     rate_every: int  # steps between two with the rate in the loss
+    passed_over: float  # of the mean gradient: anchors that showed less are passed over; 0: none are
     start: Start
     reasons: Mapping[str, str] = field(default_factory=dict)  # by field, of those that a rule has set
     # of the photographs, between two points that are found in them before the run (`compgs.stereo`); 0: none are
@@ -450,6 +460,7 @@ def _by_settings(config: Config, start: Start) -> dict[str, Any]:
         "dropout": 0.0,
         "coarse_until": 0.0,
         "rate_every": 1,
+        "passed_over": 0.0,
         "dense_points": 0.0,
         "poses": config.training.poses == "on",
     }
@@ -491,6 +502,7 @@ def _expected(plan: Plan) -> dict[str, tuple[bool, str]]:
         "bit_discount": number("bit_discount", 1.0),
         "dropout": number("dropout", 0.5),
         "coarse_until": number("coarse_until", 1.0),
+        "passed_over": number("passed_over", 1.0),
         "dense_points": number("dense_points", 1e4),
         "poses": one_of("poses", True, False),
     }

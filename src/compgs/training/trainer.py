@@ -27,6 +27,7 @@ from compgs.training.run.parts import Part
 from compgs.training.run.scene_trainer import SceneTrainer
 from compgs.training.run.status import StepResult, nothing_shown
 from compgs.training.shortcuts.coarse import CoarseViews
+from compgs.training.shortcuts.hidden import HiddenAnchors
 from compgs.training.start import initial_model, plan_of
 from compgs.training.step.latents import StepLatents
 from compgs.training.step.moment import Moment, moment
@@ -66,13 +67,16 @@ class Trainer(SceneTrainer):
         self.survey = Survey(model, scene, self.settings, lambda: self.step)
         self.optimizer = make_optimizer(model, t)
         self.schedule = make_schedule(config.control, t.steps, views, t.views_per_step)
-        self.control = AdaptiveControl(config, self.schedule, self.survey.shape, device)
+        self.hidden = HiddenAnchors(plan.passed_over, views, self.survey.shape, device)
+        follow = (self.hidden.replaced,)
+        self.control = AdaptiveControl(config, self.schedule, self.survey.shape, device, follow)
         self.noise = UniformNoise(t.seed + 3, self.views.chance, device)
         self.rate = RateState(t.lmbda)
         self.coarse = CoarseViews(self.views, plan.coarse_until)
         self.pictures = Pictures(self.settings, t.ssim_weight)
         self.latents = StepLatents(model, t.rate)
-        self.gradients = ViewGradients(model, scene, t, plan, self.pictures, self.coarse, self.control)
+        seen = self.pictures, self.coarse, self.hidden, self.control
+        self.gradients = ViewGradients(model, scene, t, plan, *seen)
         tools = self.optimizer, self.survey, self.control, self.chance
         self.structure = Structure(config, plan, model, *tools)
 
@@ -81,7 +85,7 @@ class Trainer(SceneTrainer):
     def train_step(self) -> StepResult:
         """Quantize, predict, rasterize, compare (the paper's Fig. 2 from left to right), go back; then move."""
         now = self.now
-        views = self.views_of_step()
+        views = self.views_of_step(now)
         if len(views.seen.rows) == 0:  # nothing can be learned from views that no anchor is in
             self.finish_step()
             return self.nothing_shown(views)
@@ -96,10 +100,14 @@ class Trainer(SceneTrainer):
         """What the phases of the run ask of the step that comes next."""
         return moment(self.step, self.rate.lmbda, self.config.training, self.plan, watched=self.watched)
 
-    def views_of_step(self) -> StepViews:
-        """Choose the views of this step, and the anchors that they may show. The rate is of all of these."""
+    def views_of_step(self, now: Moment) -> StepViews:
+        """Choose the views of this step, and the anchors that they may show. The rate is of all of these; steps without
+        it pass over those that were hidden.
+        """
         views = self.views.next()
         rows = [self.survey.visible_anchors(self.scene.train_views[view].camera) for view in views]
+        if now.passes_over:
+            rows = [self.hidden.others(view, of_view) for view, of_view in zip(views, rows, strict=True)]
         return step_views(views, rows, self.model.anchors, self.noise)
 
     def learn(self, views: StepViews, now: Moment) -> StepResult:
@@ -179,7 +187,7 @@ class Trainer(SceneTrainer):
         self.rate = RateState.restored(state["rate"])
 
     def parts(self) -> Sequence[Part]:
-        return (*self.structure.parts(), self.survey.bounds)
+        return (*self.structure.parts(), self.survey.bounds, self.hidden)
 
     @classmethod
     def resumed(cls, scene: Scene, path: Path, config: Config, device: torch.device) -> "Trainer":

@@ -15,6 +15,7 @@ enough (`minimum_share`). From 103 views on, a fifth of 2 V steps is no less tha
 """
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -114,10 +115,13 @@ class AdaptiveControl:
         schedule: ControlSchedule,
         shape: tuple[int, int],  # N, K
         device: torch.device,
+        followers: Sequence[Callable[[Tensor, int], None]] = (),
     ) -> None:
+        """`followers`: told of every change which anchors are left, [N] bool, and how many new ones follow them."""
         self.config = config
         self.variant = VARIANTS[config.control.variant]
         self.schedule = schedule
+        self.followers = followers
         anchors, k = shape
         self.gradient = torch.zeros(anchors, k, device=device)  # sum of 2D gradient norms, in half images
         self.drawn = torch.zeros(anchors, k, device=device)  # views in which the primitive was drawn
@@ -194,6 +198,8 @@ class AdaptiveControl:
         for name in self.STATISTICS:
             old = getattr(self, name)
             setattr(self, name, torch.cat([old[kept], old.new_zeros(new, *old.shape[1:])]))
+        for follow in self.followers:
+            follow(kept, new)
 
     def _grow(
         self, model: Grows, means: Tensor, gradient: Tensor, noise: torch.Generator, lmbda: float
