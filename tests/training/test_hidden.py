@@ -5,9 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torch import Tensor
 
+from compgs.gaussians import Gaussians
 from compgs.tensors.rasterize import rasterize
-from compgs.training.shortcuts.hidden import GradientSizes, HiddenAnchors
+from compgs.training.shortcuts.hidden import GradientSizes, HiddenAnchors, with_gradient_sizes
 from compgs.training.step.step_views import step_views
 from compgs.training.survey import predict_view
 from compgs.training.trainer import Trainer
@@ -161,3 +163,49 @@ def test_a_view_hardly_changes_without_what_is_hidden_in_it(trainer):
         left_out += len(rows) - len(shown)
     hidden, others = torch.tensor(changes).mean(0)
     assert left_out > 0 and hidden < 0.25 * others, (left_out, hidden, others)
+
+
+def leaves(dtype: torch.dtype) -> Gaussians[Tensor]:
+    chance = torch.Generator().manual_seed(0)
+    shapes = (400, 3), (400, 4), (400, 3), (400,), (400, 3)
+    return Gaussians(*(torch.rand(s, generator=chance).to(dtype).requires_grad_() for s in shapes))
+
+
+def weighed(found: Gaussians[Tensor], weights: Tensor) -> Tensor:
+    return (
+        weights * (3 * found.opacities + found.colors.sum(1))
+        + weights**2 * (found.means + found.scales).sum(1)
+    ).sum() + (found.quaternions**2).sum()
+
+
+def test_sizes_of_gradients_are_known_after_the_backward_pass_which_they_do_not_change() -> None:
+    given, plain, weights, sizes = (
+        leaves(torch.float32),
+        leaves(torch.float32),
+        10.0 ** torch.linspace(-4, 0, 400),
+        GradientSizes(),
+    )
+    found = with_gradient_sizes(given, sizes)
+    assert sizes.values is None
+    weighed(found, weights).backward()
+    weighed(plain, weights).backward()
+    for name in ("means", "quaternions", "scales", "opacities", "colors"):
+        assert torch.equal(getattr(given, name).grad, getattr(plain, name).grad), name
+    scales = given.scales.detach().double()
+    shown = 6 * weights.double()
+    placed = 2 * weights.double() ** 2 * scales.sum(1)
+    expected = (shown / shown.mean() + placed / placed.mean()) / 2
+    assert sizes.values is not None
+    torch.testing.assert_close(sizes.values.double(), expected, rtol=1e-5, atol=0)
+
+
+def test_nothing_is_small_beside_nothing() -> None:
+    given, sizes = leaves(torch.float32), GradientSizes()
+    weighed(with_gradient_sizes(given, sizes), torch.zeros(400)).backward()
+    assert sizes.values is not None and not (sizes.values < 1e9).any()
+
+
+def test_other_precisions_do_without_sizes() -> None:
+    given, sizes = leaves(torch.float64), GradientSizes()
+    weighed(with_gradient_sizes(given, sizes), torch.ones(400)).backward()
+    assert sizes.values is None and given.means.grad is not None

@@ -138,6 +138,7 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         ({"sightings": 11.0}, "dropout", 0.2),
         ({"sightings": 22.0}, "dropout", 0.0),
         ({"sightings": 11.0}, "bit_discount", 0.5),
+        ({"processes": 2}, "passed_over", 0.0),
         ({"pixels": 160_000}, "coarse_until", 0.7),
         ({"pixels": 159_999}, "coarse_until", 0.0),
         ({"views": 60}, "pruning_views", 48),
@@ -165,13 +166,13 @@ def test_the_paper_preset_applies_no_rule() -> None:
         assert (found.coupled_primitives, found.width, found.heads) == (10, 32, "separate")
         assert found.residuals and found.reference_context == "hyperprior" and found.head_bits == 8
         assert (found.dilation, found.voxel_spacings, found.dropout, found.rate_every) == (0.3, 1.0, 0, 1)
-        assert not (found.coarse_until or found.reasons)
+        assert not (found.passed_over or found.coarse_until or found.reasons)
     assert growth_factor(paper, 0.1) == 1.0 and grid_spacings(paper) == 1.0
 
 
 def test_the_plan_of_a_run_with_former_decisions_is_read() -> None:
     found = plan(Config(), USUAL)
-    older = found.to_dict() | {"sampled_gradients": 0.1, "passed_over": 0.03}
+    older = found.to_dict() | {"sampled_gradients": 0.1}
     assert Plan.from_dict(older) == found
 
 
