@@ -371,7 +371,7 @@ def one_step(device: str) -> dict[str, Any]:
         generate_scene(Path(folder) / "scene", views=12, width=160, height=120)
         scene = load_scene(Path(folder) / "scene")
         config = load_config("default")
-        training = replace(config.training, rules="all but coarse_photographs", lmbda=0.002)
+        training = replace(config.training, rules="all but hidden_anchors, coarse_photographs", lmbda=0.002)
         trainer = Trainer(scene, replace(config, training=training), torch.device("cpu"))
         chance = torch.Generator().manual_seed(5)
         with torch.no_grad():

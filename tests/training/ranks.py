@@ -41,6 +41,7 @@ CONFIG = Config(
         seed=3,
         views_per_step=2,
         exposure=True,
+        rules="all but hidden_anchors",
         phases=Phases(rate=0.0),
     ),
 )

@@ -24,6 +24,8 @@ from compgs.training.run.model_checkpoint import load_checkpoint
 from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 
+from .rules import without
+
 CPU = torch.device("cpu")
 SHIFT = (4.2e6, 5.1e5, 3e3)  # metres
 
@@ -65,7 +67,7 @@ def small(config: Config) -> Config:
         config,
         model=replace(config.model, voxel_size=0.125),
         control=replace(config.control, start=1.0, stop=0.0, prune_at=()),
-        training=replace(config.training, steps=30),
+        training=replace(config.training, steps=30, rules=without(config.training.rules, "hidden_anchors")),
     )
 
 

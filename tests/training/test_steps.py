@@ -21,7 +21,7 @@ STEPS = 20
 # Nothing is left to chance: no primitive is left out, and from the first step on the likelihood sees symbols.
 CERTAIN = {
     "steps": STEPS,
-    "rules": without(SIZES_AS_SET, "dropout", "rate_every"),
+    "rules": without(SIZES_AS_SET, "dropout", "hidden_anchors", "rate_every"),
     "phases": Phases(rate=0.0, symbols=0.0),
 }
 
