@@ -22,7 +22,7 @@ from typing import Any
 
 from compgs.config import load_config
 from compgs.errors import ConfigError
-from compgs.former_settings import FORMER_DECISIONS, without_former
+from compgs.former_settings import FORMER_RULES, without_former
 from compgs.outputs import write_bytes
 from compgs.training.plan import RULES, Plan, plan
 
@@ -86,7 +86,7 @@ def outdated(record: Record) -> list[str]:
     now = plan(config, ran.start)
     decided = {f.name for f in fields(Plan)} - {"start", "reasons"}
     found = [name for name in sorted(decided) if getattr(ran, name) != getattr(now, name)]
-    found += [name for name in FORMER_DECISIONS if record["plan"].get(name)]
+    found += [name for name in FORMER_RULES if record["plan"].get(name)]
     try:
         settings = without_former(record["settings"], record["name"])
     except ConfigError:

@@ -90,10 +90,9 @@ FORMER = {
     "entropy.residual_step": _of_steps(),
     "entropy.covariance_step": _of_steps(),
 }
-# Former rules, which saved time and changed nothing else: a run that left one out is what every run is now.
+# Former rules, which saved time and changed nothing else: a run that left one out is what every run is now. What they
+# decided has the same name in the plan of a run.
 FORMER_RULES = ("sampled_gradients",)
-# What they decided, in the plan of a run.
-FORMER_DECISIONS = ("sampled_gradients",)
 # The former settings of `training` that `training.phases` holds now, in its order, with their defaults.
 PHASES = {
     "head_warm_up": 0.05,

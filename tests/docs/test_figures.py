@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from compgs.config import load_config
-from compgs.former_settings import FORMER_DECISIONS
+from compgs.former_settings import FORMER_RULES
 from compgs.training.plan import Start, plan
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -56,7 +56,7 @@ def test_a_row_names_its_commit_exactly_if_the_preset_of_today_would_train_other
         record["plan"].get(name, 0) == value
         for name, value in now.items()
         if name not in ("start", "reasons")
-    ) and not any(record["plan"].get(name) for name in FORMER_DECISIONS)
+    ) and not any(record["plan"].get(name) for name in FORMER_RULES)
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert (f"{record['page']}), at {record['commit']} |" in readme) == (not same)
 

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from compgs.config import MAX_VIEWPOINTS, MOST_COUPLED, Config, ModelConfig
 from compgs.errors import ConfigError
-from compgs.former_settings import FORMER_DECISIONS
+from compgs.former_settings import FORMER_RULES
 from compgs.render.settings import LEAST_DILATION
 
 # lambda for which the settings of growth are given, and the range in which it follows lambda: below 1e-6 more anchors
@@ -334,7 +334,7 @@ class Plan:
     def from_dict(cls, values: Any) -> "Plan":
         """Inverse of `to_dict`. Raises ValueError for what is no plan."""
         try:
-            fields = {name: value for name, value in dict(values).items() if name not in FORMER_DECISIONS}
+            fields = {name: value for name, value in dict(values).items() if name not in FORMER_RULES}
             start, reasons = Start(**fields["start"]), {str(k): str(v) for k, v in fields["reasons"].items()}
             plan = cls(**{**fields, "start": start, "reasons": reasons})
         except (TypeError, KeyError, AttributeError) as error:

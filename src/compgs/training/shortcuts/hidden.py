@@ -82,6 +82,13 @@ class HiddenAnchors:
             return rows
         return rows[(self.hidden[rows, view // 8] & (1 << view % 8)) == 0]
 
+    def measured(self, gaussians: Gaussians[Tensor]) -> tuple[Gaussians[Tensor], GradientSizes]:
+        """The same Gaussians, and how large their gradients are once the backward pass is over; not known where none are
+        hidden.
+        """
+        sizes = GradientSizes()
+        return (with_gradient_sizes(gaussians, sizes) if self.share > 0.0 else gaussians), sizes
+
     def observe(
         self, view: int, rows: Tensor, prediction: Prediction, gaussians: Gaussians, sizes: GradientSizes
     ) -> None:

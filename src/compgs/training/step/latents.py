@@ -17,8 +17,8 @@ from compgs.trained_model import TrainedModel
 from compgs.training.step.moment import Moment
 from compgs.training.step.step_views import StepViews
 
-# Anchors of a step that the neighbours' network learns from at most. It has a hundred weights; what around them has
-# would take an eighth of a step's time where 100 000 are in view.
+# Anchors of a step that the neighbours' network learns from at most. It has a hundred weights; to describe the
+# surroundings of all anchors in view would take a tenth of a step of Truck (docs/results/truck.md).
 LEARNED_FROM = 16_384
 
 
@@ -32,12 +32,13 @@ class StepLatents:
 
     def quantize(self, views: StepViews, now: Moment) -> Quantized:
         """Latents of the anchors in view as the decoder will have them, and their bits (Sec. 3.3)."""
+        rate = now.rate_weight > 0
         return self.model.quantized(
             views.own.rows,
-            rate=now.rate_weight > 0,
+            rate=rate,
             noise=None if now.hard else views.noise_of_latents(),
             stored_weights=now.stored,
-            sample=self.sample_of(views),
+            sample=self.sample_of(views) if rate else None,
         )
 
     def sample_of(self, views: StepViews) -> Tensor | None:

@@ -21,7 +21,7 @@ from compgs.trained_model import TrainedModel
 from compgs.training.plan import Plan
 from compgs.training.run.status import StepResult
 from compgs.training.shortcuts.coarse import CoarseViews
-from compgs.training.shortcuts.hidden import GradientSizes, HiddenAnchors, with_gradient_sizes
+from compgs.training.shortcuts.hidden import HiddenAnchors
 from compgs.training.step.dropout import thinned
 from compgs.training.step.latents import pass_gradients_back
 from compgs.training.step.moment import Moment
@@ -82,9 +82,7 @@ class ViewGradients:
             geometry = geometry.of(None if part is None else self.model.slots(part))
         noise = views.noise_of_view(number)
         prediction, gaussians = self.predict(shown.of(part), rows, camera, now, noise, geometry)
-        sizes = GradientSizes()
-        if self.hidden.share > 0.0:
-            gaussians = with_gradient_sizes(gaussians, sizes)
+        gaussians, sizes = self.hidden.measured(gaussians)
         learned = self.coarse.views
         rendered = self.pictures.rasterize(
             learned.posed(view, gaussians, camera), camera, watched=now.watched
