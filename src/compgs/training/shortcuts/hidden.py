@@ -83,8 +83,8 @@ class HiddenAnchors:
         return rows[(self.hidden[rows, view // 8] & (1 << view % 8)) == 0]
 
     def measured(self, gaussians: Gaussians[Tensor]) -> tuple[Gaussians[Tensor], GradientSizes]:
-        """The same Gaussians, and how large their gradients are once the backward pass is over; not known where none are
-        hidden.
+        """The same Gaussians, and how large their gradients are once the backward pass is over; not known where no
+        anchor is ever hidden.
         """
         sizes = GradientSizes()
         return (with_gradient_sizes(gaussians, sizes) if self.share > 0.0 else gaussians), sizes
