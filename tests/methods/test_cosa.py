@@ -59,7 +59,8 @@ def test_presets_differ_in_what_they_are_for() -> None:
     assert default.control == paper.control == quick.control != Config().control
     assert (default.model.coupled_primitives, paper.model.coupled_primitives) == (5, 10)
     assert isinstance(paper, CosaConfig) and (paper.cosa.head_bits, paper.cosa.symbols_start) == (16, 1.0)
-    assert quick.training.steps == Config().training.steps * 4000 // 30_000
+    steps = Config().training.steps, 30_000, 4_000
+    assert (default.training.steps, paper.training.steps, quick.training.steps) == steps
 
 
 def test_the_suffix_is_the_containers() -> None:

@@ -57,7 +57,7 @@ class Train(TrainingCommand):
 
     compgs train -o runs/garden --resume
 
-    torchrun --nproc-per-node 8 -m compgs train scenes/garden -o runs/eight --set training.views_per_step=8 --steps 3750
+    torchrun --nproc-per-node 8 -m compgs train scenes/garden -o runs/eight --set training.views_per_step=8 --steps 1875
     """
 
     method: Annotated[

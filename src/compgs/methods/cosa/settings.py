@@ -76,6 +76,7 @@ class CosaConfig(Config):
 PRESETS = {
     "paper": {
         **CHANGED,
+        "training": {**CHANGED["training"], "steps": 30_000},
         "model": {"coupled_primitives": 10},
         "cosa": {"head_bits": 16, "symbols_start": 1.0, "mask_lr": (0.01, 0.01)},
     },

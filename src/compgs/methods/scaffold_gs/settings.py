@@ -23,6 +23,7 @@ PUBLISHED: Mapping[str, Mapping[str, Any]] = {
         "variant": "scaffold-gs",
     },
     "training": {
+        "steps": 30_000,
         "schedule": "exponential",
         "phases": Phases(warm=0.0),
     },
