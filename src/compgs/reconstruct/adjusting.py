@@ -8,13 +8,10 @@ from typing import Any
 import numpy as np
 
 from compgs.reconstruct.features import find_features
+from compgs.reconstruct.last_fit import LEAST_ANGLE, MOST_ERROR, pixels_of_features, robust_options
 
 FEW_SEEN = 50  # common points of a photograph, of which fewer hardly say where it is
-# Pixels: a point that is off by more is none of a photograph's, and says nothing of its camera; it may be off by more
-# while cameras are as they came.
-MOST_ERROR, MOST_ERROR_AT_FIRST = 1.5, 4.0
-LEAST_ANGLE = 1.0  # degrees between the rays to a point
-MOST_STEPS = 150  # of a round: it ends earlier where nothing moves any more
+MOST_ERROR_AT_FIRST = 4.0  # in place of MOST_ERROR, while cameras are as they came
 ROUNDS = 2  # with all points, and with those that fit
 
 
@@ -45,14 +42,15 @@ def adjust(job: dict[str, Any], tell: Callable[..., None]) -> None:
     folder = database.with_name("triangulated")
     folder.mkdir()
     model = pycolmap.triangulate_points(model, database, images, folder, refine_intrinsics=False)
-    before, placed = errors(model), _places(model)
+    unit = pixels_of_features(model, job["feature_size"])
+    before, placed = errors(model, MOST_ERROR * unit), _places(model)
     seldom = [image.image_id for image in model.images.values() if image.num_points3D < FEW_SEEN]
     for done in range(ROUNDS):
         most = MOST_ERROR if done else MOST_ERROR_AT_FIRST
-        pycolmap.ObservationManager(model).filter_all_points3D(most, LEAST_ANGLE)
+        pycolmap.ObservationManager(model).filter_all_points3D(most * unit, LEAST_ANGLE)
         _fit(model, threads)
         tell("round", done + 1)
-    after = errors(model)
+    after = errors(model, MOST_ERROR * unit)
     old = {image.name: image for image in given.images.values()}
     real = {short: name for name, short in job["names"].items()}
     _bring_back(model, {image_id: old[real[image.name]] for image_id, image in model.images.items()})
@@ -111,13 +109,9 @@ def _fit(model: Any, threads: int) -> None:
     """
     import pycolmap
 
-    options = pycolmap.BundleAdjustmentOptions()
+    options = robust_options(threads)
     options.refine_focal_length = False
-    options.refine_principal_point = options.refine_extra_params = True
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.solver_options.max_num_iterations = MOST_STEPS
-    options.ceres.solver_options.num_threads = threads
+    options.refine_principal_point = True
     pycolmap.bundle_adjustment(model, options)
 
 
@@ -134,9 +128,10 @@ def _bring_back(model: Any, given: dict[int, Any]) -> None:
         model.transform(moved)
 
 
-def errors(model: Any) -> tuple[float, float]:
+def errors(model: Any, most: float) -> tuple[float, float]:
     """Mean distance from features to where their points are seen, and the root mean square of what is common to it in a
     part of a photograph (a quadratic polynomial of the place, by least squares); pixels, means over the photographs.
+    Features that are off by more than `most` pixels are none of their points'.
     """
     distances, common = [], []
     for image in model.images.values():
@@ -146,7 +141,7 @@ def errors(model: Any) -> tuple[float, float]:
         places = np.array([point.xy for point in seen])
         points = np.array([model.points3D[point.point3D_id].xyz for point in seen])
         off = places - image.camera.img_from_cam(image.cam_from_world() * points)
-        fits = np.isfinite(off).all(axis=1) & (np.hypot(*off.T) < MOST_ERROR_AT_FIRST)
+        fits = np.isfinite(off).all(axis=1) & (np.hypot(*off.T) < most)
         if fits.sum() < FEW_SEEN:
             continue
         off, (x, y) = off[fits], (places[fits] / max(image.camera.width, image.camera.height)).T

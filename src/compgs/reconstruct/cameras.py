@@ -6,7 +6,6 @@ from typing import Literal
 from compgs.reconstruct.photographs import Photograph
 
 SharedCamera = Literal["one", "folder", "each"]
-MANY_PHOTOGRAPHS = 20  # of one camera: so many determine four distortion coefficients and the lens's center
 
 
 def shared_camera(photographs: Sequence[Photograph]) -> SharedCamera:
@@ -21,4 +20,4 @@ def shared_camera(photographs: Sequence[Photograph]) -> SharedCamera:
 
 def lens_model(shared: SharedCamera, photographs: int) -> str:
     """COLMAP's name of the lens model: four distortion coefficients where many photographs determine them."""
-    return "OPENCV" if shared == "one" and photographs >= MANY_PHOTOGRAPHS else "SIMPLE_RADIAL"
+    return "OPENCV" if shared == "one" and photographs >= 20 else "SIMPLE_RADIAL"
