@@ -26,7 +26,8 @@ from compgs.render.settings import LEAST_DILATION
 USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 # A file of b bytes for each anchor of the beginning comes of a lambda of about 0.04 / b^1.5: fitted to the default
 # preset's curves of docs/results (plush and brighton, 1 500 and 5 000 steps, lambda 0.0001 to 0.1). Sizes are met
-# within a factor of 2 (one standard deviation), at worst 3.5; those of Truck (93 431 anchors) and Bonsai within 1.6.
+# within a factor of 2 (one standard deviation), at worst 3.5; those of Truck (93 431 anchors; with
+# its points of a sweep they become more than these) and Bonsai within 2.3.
 ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 1.5
 SIZED_ANCHORS = 1_000, 200_000  # of the beginning, between which that is taken to hold
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
