@@ -7,7 +7,7 @@ cameras.py       which photographs share a camera                   mapping.py  
 worker.py        the process that runs them                         report.py   what came out: numbers and a picture
 retrieval.py     which photographs are worth comparing              adjust.py   better cameras for a capture
 adjusting.py     the bundle adjustment itself, run aside            features.py  features, for both
-scene_folder.py  a folder that appears when it is whole             last_fit.py  the last adjustment
+scene_folder.py  a folder that appears when all of it is there
 ```
 """
 

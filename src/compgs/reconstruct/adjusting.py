@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 
 from compgs.reconstruct.features import find_features
-from compgs.reconstruct.last_fit import LEAST_ANGLE, MOST_ERROR, pixels_of_features, robust_options
 
 FEW_SEEN = 50  # common points of a photograph, of which fewer hardly say where it is
-MOST_ERROR_AT_FIRST = 4.0  # in place of MOST_ERROR, while cameras are as they came
+# Pixels of the photographs as features were found in them: a point that is off by more is none of a photograph's, and
+# says nothing of its camera; it may be off by more while cameras are as they came.
+MOST_ERROR, MOST_ERROR_AT_FIRST = 1.5, 4.0
+LEAST_ANGLE = 1.0  # degrees between the rays to a point
+MOST_STEPS = 150  # of a round: it ends earlier where nothing moves any more
 ROUNDS = 2  # with all points, and with those that fit
 
 
@@ -42,7 +45,8 @@ def adjust(job: dict[str, Any], tell: Callable[..., None]) -> None:
     folder = database.with_name("triangulated")
     folder.mkdir()
     model = pycolmap.triangulate_points(model, database, images, folder, refine_intrinsics=False)
-    unit = pixels_of_features(model, job["feature_size"])
+    longest = max(max(camera.width, camera.height) for camera in model.cameras.values())
+    unit = max(1.0, longest / job["feature_size"])
     before, placed = errors(model, MOST_ERROR * unit), _places(model)
     seldom = [image.image_id for image in model.images.values() if image.num_points3D < FEW_SEEN]
     for done in range(ROUNDS):
@@ -109,9 +113,13 @@ def _fit(model: Any, threads: int) -> None:
     """
     import pycolmap
 
-    options = robust_options(threads)
+    options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = False
-    options.refine_principal_point = True
+    options.refine_principal_point = options.refine_extra_params = True
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.max_num_iterations = MOST_STEPS
+    options.ceres.solver_options.num_threads = threads
     pycolmap.bundle_adjustment(model, options)
 
 

@@ -14,7 +14,6 @@ from typing import Any
 
 from compgs.reconstruct.adjusting import adjust
 from compgs.reconstruct.features import find_features
-from compgs.reconstruct.last_fit import fit_again
 
 
 def main() -> None:
@@ -67,7 +66,6 @@ def find_poses(job: dict[str, Any]) -> None:
         initial_image_pair_callback=lambda: _tell("registered", 2),
         next_image_callback=lambda: _tell("registered", 1),
     )
-    fit_again(Path(job["models"]), job["feature_size"], threads)
 
 
 @contextmanager
