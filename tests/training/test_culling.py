@@ -100,3 +100,10 @@ def test_what_was_measured_goes_on_with_a_run(trained, blob_scene, tiny_config, 
     with torch.no_grad():
         again.model.log_scales.add_(1.0)
     assert torch.allclose(again.survey.bounds.radii(), torch.e * trained.survey.bounds.radii())
+
+
+def test_what_was_measured_is_forgotten_when_anchors_are_pruned(trained):
+    trained.survey.bounds.radii()
+    assert trained.survey.bounds.measured is not None
+    trained.structure.act(min(trained.structure.pruned_at), trained.rate)
+    assert trained.survey.bounds.measured is None
