@@ -1,5 +1,8 @@
 """The size that a file would have, against files that are written."""
 
+import math
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -9,8 +12,9 @@ from compgs.codec.writer import write_content
 from compgs.config import Config
 from compgs.scene.views import Scene
 from compgs.trained_model import TrainedModel
-from compgs.training.rate.file_size import FileSize, fixed_bytes
+from compgs.training.rate.file_size import FileSize, anchor_bits, fixed_bytes
 from compgs.training.start import initial_model
+from compgs.training.trainer import Trainer
 
 
 @pytest.fixture
@@ -78,3 +82,15 @@ def test_a_written_file_takes_its_share_of_what_training_pays_for(model: Trained
     assert share < 0.97
     expected = share * size.latents() + fixed_bytes(model)
     assert expected == pytest.approx(len(write_content(to_content(model))), abs=1)
+
+
+def test_the_last_pruning_leaves_three_percent_more_than_the_size_at_most_and_earlier_ones_any_number(
+    blob_scene: Scene, tiny_config: Config
+) -> None:
+    config = replace(tiny_config, training=replace(tiny_config.training, target_bytes=60_000))
+    structure = Trainer(blob_scene, config, torch.device("cpu")).structure
+    bits = anchor_bits(structure.model)
+    last = max(structure.pruned_at)
+    least, most = structure.target_size.bits_to_keep(last, bits, 1.0)
+    assert 0 < least < math.inf and most == pytest.approx(1.03 * least)
+    assert structure.target_size.bits_to_keep(last - 1, bits, 1.0) == (pytest.approx(least), math.inf)

@@ -12,6 +12,7 @@ from compgs.render import render
 from compgs.scene.views import Scene, View
 from compgs.tensors.ssim import ssim
 from compgs.training.rate.rate_control import RateState
+from compgs.training.step.moment import moment
 from compgs.training.trainer import Trainer
 
 from .rules import SIZES_AS_SET, without
@@ -114,6 +115,38 @@ def test_the_rate_joins_the_loss_and_symbols_take_the_place_of_noise_at_their_sh
     for step in (5, 9):
         assert abs(found[step] - 1) > 0.002, "noise is not the symbols"
         assert found[step] == pytest.approx(1, abs=0.3), "but costs about as much"
+
+
+def test_the_rate_pulls_at_references_in_proportion_to_lambda(blob_scene: Scene, tiny_config: Config) -> None:
+    pulls = []
+    for lmbda in (0.0, 1.0, 3.0):
+        trainer = started(blob_scene, with_training(tiny_config, **CERTAIN))
+        trainer.rate = RateState(lmbda)
+        seen: list[torch.Tensor] = []
+
+        def keep(trainer: Trainer = trainer, seen: list[torch.Tensor] = seen) -> None:
+            assert trainer.model.references.grad is not None
+            seen.append(trainer.model.references.grad.clone())
+
+        trainer.move = keep  # type: ignore[method-assign]
+        trainer.train_step()
+        pulls += seen
+    one, three = pulls[1] - pulls[0], pulls[2] - pulls[0]
+    assert one.abs().max() > 0.1 * pulls[0].abs().max()
+    assert torch.allclose(three, 3 * one, rtol=1e-3, atol=1e-4 * float(three.abs().max()))
+
+
+def test_hidden_anchors_are_passed_over_once_the_rate_has_joined_where_it_is_not_counted(
+    tiny_config: Config, blob_scene: Scene
+) -> None:
+    config = with_training(tiny_config, **{**CERTAIN, "phases": Phases(rate=0.5)})
+    trainer = started(blob_scene, config)
+    plan, t = replace(trainer.plan, rate_every=4), config.training
+    moments = [moment(step, 1.0, t, plan, watched=False) for step in range(t.steps)]
+    half = t.steps // 2
+    assert not any(each.passes_over for each in moments[:half])
+    assert all(each.passes_over == (each.rate_weight == 0) for each in moments[half:])
+    assert any(each.passes_over for each in moments[half:])
 
 
 def test_lambda_that_follows_a_size_is_the_one_that_weighs(blob_scene: Scene, tiny_config: Config) -> None:
