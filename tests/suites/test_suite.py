@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from compgs.cli.benchmark import Benchmark
 from compgs.cli.main import parse
 from compgs.cli.train import Train
 from compgs.errors import ConfigError, SceneError
@@ -61,6 +62,11 @@ def test_shipped_suites_are_read_and_their_runs_are_commands(name: str, tmp_path
     for job in jobs_of(suite, Path("/data"), tmp_path):
         assert isinstance(parse([*job.command, "-o", "out"]), Train)
     assert all(scene.published for scene in suite.scenes)
+
+
+def test_the_help_names_every_shipped_suite() -> None:
+    named = " ".join((Benchmark.__doc__ or "").split())
+    assert f"one that is shipped: {', '.join(SHIPPED)}." in named
 
 
 def test_the_paper_s_rows_are_as_printed() -> None:

@@ -16,7 +16,8 @@ from compgs.cli.usage import UsageError, settings_of_options
 class Benchmark(Command):
     """Run a suite of scenes, methods, rates and seeds, and write the tables of the paper.
 
-    SUITE is a TOML file, or one that is shipped: bungeenerf, captures, deep_blending, mip_nerf_360, tanks_and_temples.
+    SUITE is a TOML file, or one that is shipped: bungeenerf, captures, deep_blending, mip_nerf_360, sector,
+    tanks_and_temples, truck.
     Each run is a `compgs train` in a folder of its own. The same command goes on after a stop, and skips
     finished runs. OUT then has table.md, .csv and .tex (quality, with published rows marked as such), complexity.*, a
     table for each scene, and report.html.
