@@ -167,7 +167,7 @@ class Tiles(TrainingCommand):
         whole = sum(file.stat().st_size for file in manifest.parent.iterdir())
         say(f"{manifest.parent}: {len(jobs)} tiles, {size(whole)}")
         self.evaluate(scene, manifest, folder, settings)
-        say_next(manifest.parent)
+        say_next(manifest.parent, Path(settings.scene.path))
 
     def planned_tiles(
         self, settings: RunSettings, scene: "Scene", folder: Path

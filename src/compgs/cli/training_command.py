@@ -176,7 +176,7 @@ class TrainingCommand(ComputingCommand, SceneOptions):
         self.evaluate(scene, path, folder, settings)
         if settings.config.training.target_bytes is not None:
             say_miss(folder, settings.config.training.target_bytes)
-        say_next(path)
+        say_next(path, Path(settings.scene.path))
 
     def show_plan(self) -> None:
         """Print what the run would decide, and stop. Raises UsageError, SceneError, ConfigError."""

@@ -23,6 +23,7 @@ from compgs.reconstruct.scene_folder import new_scene
 from compgs.scene.colmap import SparseModel, find_sparse_model, model_files, read_sparse_model
 from compgs.scene.colmap_capture import image_path
 from compgs.scene.colmap_writer import write_sparse_model
+from compgs.scene.doubt import ADJUSTMENT
 from compgs.scene.names import Names
 
 # A photograph is compared with its 10 nearest, and every 4th of the next 50.
@@ -130,7 +131,7 @@ def _adjust_in(
         shift_after=float(told["shift_after"]),
         seconds=time.monotonic() - began,
     )
-    write_json(target / "adjustment.json", {**result.__dict__, "scene": scene.name})
+    write_json(target / ADJUSTMENT, {**result.__dict__, "scene": scene.name})
     return result
 
 

@@ -1,4 +1,4 @@
-"""Whether a capture's poses may be off by a pixel: what the reconstruction says of itself."""
+"""Whether a capture's cameras may be off: what the reconstruction says of itself, and who made it."""
 
 import json
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ from compgs.scene.capture import Capture
 from compgs.scene.views import View
 
 REPORT = "reconstruction.json"  # of `compgs reconstruct`, in the scene's folder
+ADJUSTMENT = "adjustment.json"  # of `compgs adjust`
 MOST_ERROR = 1.0  # pixels of the photographs as they are read
 
 
@@ -23,6 +24,12 @@ def poses_in_doubt(folder: Path, capture: Capture, views: Sequence[View]) -> str
     here = np.median([view.camera.fx for view in views])
     error = capture.reprojection_error * float(here / there)
     return f"the reconstruction's mean error is {error:.1f} pixels" if error > MOST_ERROR else ""
+
+
+def cameras_from_elsewhere(folder: Path) -> bool:
+    """Whether a COLMAP capture that `compgs adjust` reads came with cameras that this program did not fit."""
+    adjustable = (folder / "images").is_dir() and (folder / "sparse" / "0").is_dir()
+    return adjustable and not any((folder / name).exists() for name in (REPORT, ADJUSTMENT))
 
 
 def _of_a_video(report: Path) -> bool:
