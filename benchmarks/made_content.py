@@ -1,7 +1,6 @@
 """Made-up but plausible file contents: for the codec's tests, golden files and benchmark."""
 
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 from made_heads import make_heads
@@ -20,6 +19,7 @@ from compgs.codec.content import (
 from compgs.codec.integer_network import FRACTION_BITS, Follow, IntegerLayer, IntegerNetwork
 from compgs.codec.rows import RowContext, chain_length
 from compgs.codec.tables import hyper_tables
+from compgs.config import Heads
 from compgs.ordering.order import canonical_order
 
 WEIGHT_SHIFT = 10
@@ -44,7 +44,7 @@ def paper_groups(
 def make_dimensions(
     coupled_primitives: int = 10,
     groups: tuple[GroupShape, ...] | None = None,
-    heads: Literal["separate", "paired"] = "paired",
+    heads: Heads = "paired",
     width: int = 32,
     residual_dim: int = 8,
 ) -> Dimensions:

@@ -18,6 +18,7 @@ NETWORKS = {
         "color": (True, 3, 2),
     },
     "paired": {"geometry": (False, 10, 1), "appearance": (True, 4, 1)},
+    "shallow": {"geometry": (False, 10, 0), "appearance": (True, 4, 0)},
 }
 
 

@@ -70,7 +70,7 @@ typedef struct {
     int version;
     uint32_t total_anchors;    /* of the whole file */
     uint32_t anchors, coupled; /* that are there: fewer for the beginning of a file */
-    int coupled_primitives, residual_dim, reference_dim, separate_heads, width, depth;
+    int coupled_primitives, residual_dim, reference_dim, heads, width, depth; /* heads: 0 separate, 1 paired, 2 shallow */
     double voxel_size, world_offset[3], view_distance_scale;
     float background[3], angular_dilation; /* angular_dilation 0: the file has none */
     int32_t *coordinates;                  /* [anchors, 3], canonical order */
@@ -469,7 +469,7 @@ static void cgs__read_scene(cgs__decoder *d) {
     cgs__require(d, d->promised_coupled <= s->total_anchors * (uint64_t)s->coupled_primitives,
                  "more coupled primitives than slots");
     s->residual_dim = cgs__int(&f, 1, 1, 64, "residual_dim");
-    s->separate_heads = !cgs__int(&f, 1, 0, 1, "heads");
+    s->heads = cgs__int(&f, 1, 0, s->version < CGS__FIRST_WITH_ROWS ? 1 : 2, "heads");
     s->width = cgs__int(&f, 2, 1, 1024, "width");
     s->voxel_size = cgs__real(&f, 8, small, large, "voxel_size");
     for (int i = 0; i < 3; i++) s->world_offset[i] = cgs__real(&f, 8, -large, large, "world_offset");
@@ -815,9 +815,12 @@ typedef struct {
     const char *name;
     int sees_view, outputs, blocks;
 } cgs__head;
-static const cgs__head CGS__PAIRED[] = {{"geometry", 0, 10, 1}, {"appearance", 1, 4, 1}};
-static const cgs__head CGS__SEPARATE[] = {
-    {"translation", 0, 3, 1}, {"covariance", 0, 7, 1}, {"opacity", 1, 1, 1}, {"color", 1, 3, 2}};
+/* Of each layout, by its number in the file. */
+static const int CGS__HEADS_OF[] = {4, 2, 2};
+static const cgs__head CGS__LAYOUTS[][4] = {
+    {{"translation", 0, 3, 1}, {"covariance", 0, 7, 1}, {"opacity", 1, 1, 1}, {"color", 1, 3, 2}},
+    {{"geometry", 0, 10, 1}, {"appearance", 1, 4, 1}},
+    {{"geometry", 0, 10, 0}, {"appearance", 1, 4, 0}}};
 typedef char cgs__tensor_name[CGS__MAX_NAME_BYTES + 1];
 
 static int cgs__has_residuals(const cgs_scene *s) {
@@ -838,7 +841,7 @@ static void cgs__expect_tensor(cgs_scene *s, cgs__tensor_name *names, const char
 static void cgs__expect_tensors(cgs_scene *s, cgs__tensor_name *names) {
     static const char *const outer[] = {".input_weight", ".input_bias", ".output_weight", ".output_bias", ".skip_weight"};
     static const char *const inner[] = {"weight1", "bias1", "weight2", "bias2"};
-    const cgs__head *head = s->separate_heads ? CGS__SEPARATE : CGS__PAIRED, *end = head + (s->separate_heads ? 4 : 2);
+    const cgs__head *head = CGS__LAYOUTS[s->heads], *end = head + CGS__HEADS_OF[s->heads];
     for (; head < end; head++) {
         const int inputs = s->reference_dim + 4 * head->sees_view + s->residual_dim, o = head->outputs, h = s->width;
         const int rows[] = {inputs, 0, h, 0, inputs}, columns[] = {h, h, o, o, o};
@@ -1680,8 +1683,8 @@ static int cgs__is_drawn(const double *gaussian) {
 }
 
 long cgs_predict(const cgs_scene *s, const double center[3], float *out) {
-    const cgs__head *head = s->separate_heads ? CGS__SEPARATE : CGS__PAIRED;
-    const int heads = s->separate_heads ? 4 : 2, f = s->reference_dim, e = s->residual_dim;
+    const cgs__head *head = CGS__LAYOUTS[s->heads];
+    const int heads = CGS__HEADS_OF[s->heads], f = s->reference_dim, e = s->residual_dim;
     const cgs_tensor *shared = cgs__has_residuals(s) ? NULL : s->tensor + s->tensors - 1;
     double *plain = (double *)calloc(2 * (size_t)(f + 4 + e) + 3 * (size_t)s->width, sizeof *plain);
     double *viewed = plain + f + e, *room = viewed + f + 4 + e, scales[6], position[3], offset[3];

@@ -245,7 +245,7 @@ def _scene(add: Callable, sections: Sections) -> None:
     scene("residual_dim_0", RESIDUAL_DIM, b"\0", "residual_dim 0")
     scene("residual_dim_65", RESIDUAL_DIM, bytes([65]), "residual_dim 65")
     scene("residual_dim_other", RESIDUAL_DIM, bytes([3]), "residual_dim is not that of the groups")
-    scene("heads_2", LAYOUT, b"\2", "heads 2")
+    scene("heads_3", LAYOUT, b"\3", "heads 3")
     scene("width_0", WIDTH, b"\0\0", "width 0")
     scene("width_1025", WIDTH, struct.pack("<H", 1025), "width 1025")
     scene("voxel_size_0", VOXEL_SIZE, bytes(8), "voxel_size 0")
@@ -428,6 +428,7 @@ def _heads(add: Callable, sections: Sections, old: Sections) -> None:
     more = [*tensors, QuantizedTensor(np.ones((2, 2), np.int32), 3)]
     add("heads_more", put(sections, HEADS, encode_known_heads(more)), "one tensor too many")
     add("heads_longer", put(sections, HEADS, lambda data: data + b"\0"), "a byte after the low parts")
+    add("heads_2_in_2", pack(put(old, SCENE, at(LAYOUT, b"\2")), 2), "heads 2 in version 2", ours_alone=True)
     named = list(read_content(pack(old, 2)).heads)
 
     def with_names(name: str, why: str, heads: list[tuple[str, QuantizedTensor]]) -> None:

@@ -103,8 +103,8 @@ KEPT = (*TRAINED, *FOREIGN, "dilated")
 
 def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
     """Content and levels of the ranges, by name: the smallest sensible file, one as the default preset makes it, one as
-    it makes small ones, one as the paper's preset does, one with neighbours, one as training writes them, whose rows
-    say something, one with everything unusual, one of several chunks.
+    it made small ones, one as the paper's preset does, one with neighbours, one whose rows say something, one whose
+    heads are shallow, one with everything unusual, one of several chunks.
     """
     tiny = make_content(3, 1, make_dimensions(2, paper_groups(2, 0, 1), width=2, residual_dim=2), kept=0.7)
     default = make_content(800, 2, make_dimensions(5, paper_groups(12, 0)))
@@ -126,6 +126,7 @@ def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
     return {
         **{name: (content, None) for name, content in made.items()},
         "rows": (rows(), [3, 5, 7]),
+        "shallow": (shallow(), None),
         "odd": odd(),
         "long": (long(), [depth_of(long())]),
     }
@@ -137,6 +138,11 @@ def rows() -> FileContent:
     for i in (0, 4):  # some far out, which are escaped and count for no more than others
         content.groups[i].symbols[::11] *= 12
     return replace(content, viewpoints=VIEWPOINTS)
+
+
+def shallow() -> FileContent:
+    d = make_dimensions(3, ROWS_GROUPS, "shallow", width=6)
+    return make_content(90, 8, d, kept=0.6, angular_dilation=DILATION, row_context=True)
 
 
 def odd() -> tuple[FileContent, list[int]]:

@@ -19,7 +19,6 @@ SLOPE = 2.0**-6
 TOLERANCE = 1e-4
 SIZE_TOLERANCE = 1e-6
 POSITION_TOLERANCE = 2.0**-21
-BLOCKS = {"geometry": 1, "appearance": 1, "translation": 1, "covariance": 1, "opacity": 1, "color": 2}
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class Content:
     """What a decoder has read: N anchors, P coupled primitives, numbers in the units of the document."""
 
     heads: Arrays  # by name: integers times 2^-exponent
-    layout: str  # "separate" or "paired"
+    layout: str  # "separate", "paired" or "shallow"
     coordinates: np.ndarray  # [N, 3] whole numbers of voxels
     mask: np.ndarray  # [N, K] bool: which coupled primitives exist
     references: np.ndarray  # [N, reference_dim]
@@ -86,7 +85,7 @@ def network_steps(heads: Arrays, network: str, x: Vector) -> Iterator[tuple[str,
     yield "entry", h
     h = leaky(h)
     yield "hidden", h
-    for b in range(BLOCKS[network]):
+    for b in range(sum(name.startswith(f"{network}.blocks.") for name in heads) // 4):
         u = h @ tensor(f"blocks.{b}.weight1") + tensor(f"blocks.{b}.bias1")
         yield f"block {b} entry", u
         h = h + (leaky(u) @ tensor(f"blocks.{b}.weight2") + tensor(f"blocks.{b}.bias2"))
@@ -119,7 +118,7 @@ def geometry_and_appearance(
 ) -> tuple[Vector, Vector]:
     """r [10] and a [4] of one coupled primitive."""
     heads = content.heads
-    if content.layout == "paired":
+    if content.layout != "separate":
         return (
             evaluate(heads, "geometry", reference, residual),
             evaluate(heads, "appearance", reference, view, residual),

@@ -54,6 +54,8 @@ LearningRate = Annotated[float, Range(0, 100, above=True, below=True)]
 # First and last of a run.
 LearningRates = Annotated[tuple[float, float], Range(0, 100, above=True, below=True)]
 Shares = Annotated[tuple[float, ...], Range(0, 1)]
+# Layouts of the prediction networks.
+Heads = Literal["separate", "paired", "shallow"]
 
 
 class Phases(NamedTuple):
@@ -98,8 +100,8 @@ class ModelConfig:
     # earlier symbols of an anchor, or of a coupled primitive, predict its later ones in the file (not in the paper;
     # training pays for each symbol by itself)
     row_context: bool = True
-    # separate: four networks (Sec. 3.2); paired: geometry, appearance
-    heads: Literal["separate", "paired"] = "paired"
+    # separate: four networks (Sec. 3.2); paired: geometry, appearance; shallow: these without residual blocks
+    heads: Heads = "shallow"
     # world units between neighbouring anchors; none: `voxel_spacings` decides
     voxel_size: Annotated[float | None, Range(0, above=True)] = None
     # size of a voxel, in median distances between neighbouring points, if `voxel_size` is none

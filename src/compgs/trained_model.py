@@ -7,13 +7,13 @@ import copy
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
 from compgs.cameras import Camera
-from compgs.config import Config, ModelConfig
+from compgs.config import Config, Heads, ModelConfig
 from compgs.devices import placed
 from compgs.entropy.models import Quantized, make_entropy_model
 from compgs.entropy.neighbourhood import Neighbourhood, neighbourhood
@@ -97,7 +97,7 @@ class ModelDimensions:
     reference_dim: int
     residual_dim: int
     width: int  # hidden, of the prediction networks
-    heads: Literal["separate", "paired"]
+    heads: Heads
 
 
 class TrainedModel(nn.Module):

@@ -96,7 +96,7 @@ def test_golden_files_show_what_the_format_has() -> None:
                 features.add(("layers", len(group.prior.layers), group.prior.skip))
                 rows = group.prior.rows
                 features.add(("rows", shape.role, rows.chain is not None, rows.inertia > 0))
-    expected: set[object] = {"paired", "separate", "residuals", ("ranges", 1), ("ranges", 3)}
+    expected: set[object] = {"paired", "separate", "shallow", "residuals", ("ranges", 1), ("ranges", 3)}
     expected |= {("moved", True), ("moved", False), ("symbol", MAX_SYMBOL), ("symbol", -MAX_SYMBOL)}
     expected |= {(role, kind) for role in Role for kind in ("network", "tables")}
     several = {Role.SIDE: 2, Role.REFERENCE: 3, Role.LOG_SCALES: 2, Role.RESIDUAL: 2}

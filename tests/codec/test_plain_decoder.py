@@ -20,6 +20,7 @@ from compgs.codec.tables import gaussian_tables
 from compgs.codec.viewpoints import Viewpoint, Viewpoints, decode_viewpoints, encode_viewpoints
 from compgs.codec.weights import QuantizedTensor, encode_networks
 from compgs.codec.writer import write_content
+from compgs.config import Heads
 from compgs.errors import CompGSError
 
 ROOT = Path(__file__).parents[2]
@@ -82,7 +83,7 @@ def assert_same(found: dict, content: FileContent, latents: tuple[np.ndarray, ..
         assert tuple(ours["steps"]) == group.shape.steps
         assert same(ours["symbols"], group.symbols) and same(ours["latents"], rows)
     scene = found["scene"]
-    assert ("separate", "paired")[scene["heads"]] == content.heads_layout
+    assert ("separate", "paired", "shallow")[scene["heads"]] == content.heads_layout
     for name in (
         "coupled_primitives",
         "residual_dim",
@@ -122,12 +123,13 @@ def random_content(seed: int) -> FileContent:
     """
     rng = np.random.default_rng(seed)
     dilation = DILATION if seed % 2 else None
+    heads: Heads = "shallow" if seed % 4 == 1 else "paired"
     slots = int(rng.integers(1, 5))
     anchors = int(rng.choice([1, 2, 5, 12, 24]))
     content = make_content(
         anchors,
         seed,
-        make_dimensions(slots, _random_groups(rng), residual_dim=int(rng.integers(1, 65))),
+        make_dimensions(slots, _random_groups(rng), heads, residual_dim=int(rng.integers(1, 65))),
         kept=float(rng.choice([0, 0.3, 0.8, 1])),
         blocks=int(rng.integers(3)),
         hidden=int(rng.integers(1, 6)),

@@ -52,7 +52,7 @@ def counts() -> torch.Tensor:
     return counts
 
 
-@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("layout", ["paired", "separate", "shallow"])
 @pytest.mark.parametrize("block", [1, 7, 8, 1 << 14])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["by kernels", "by torch"])
 def test_every_block_size_gives_the_gaussians_of_prediction(monkeypatch, counts, layout, block, dtype):
@@ -91,7 +91,7 @@ def test_bounds_are_the_farthest_reach_of_each_anchors_primitives(monkeypatch, c
             assert radii[i] == 0
 
 
-@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("layout", ["paired", "separate", "shallow"])
 def test_nothing_in_view_is_no_gaussians(counts, layout):
     model = make_model(layout, counts)
     nothing = model.gaussians(CAMERA, np.zeros(N, np.bool_))
@@ -111,7 +111,7 @@ def test_anchors_out_of_view_change_nothing(counts):
         assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("layout", ["paired", "separate", "shallow"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["by kernels", "by torch"])
 def test_what_is_drawn_is_named_by_its_row_among_all_primitives(monkeypatch, counts, layout, dtype):
     monkeypatch.setattr(hybrid_model, "BLOCK", 7)

@@ -59,7 +59,7 @@ def counts_with(*special: int) -> torch.Tensor:
     return counts
 
 
-@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("layout", ["paired", "separate", "shallow"])
 @pytest.mark.parametrize("special", [(0, 0, 1), (ROWS, 0, ROWS - 1), (3 * ROWS + 1, ROWS + 1)])
 @pytest.mark.parametrize("share", [0.02, 0.6, 1.0])
 def test_gaussians_agree_with_float64_whatever_the_number_of_primitives(special, share, layout):
@@ -77,7 +77,7 @@ def test_gaussians_agree_with_float64_whatever_the_number_of_primitives(special,
         )
 
 
-@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("layout", ["paired", "separate", "shallow"])
 @pytest.mark.parametrize("block", [1, ANCHORS, ANCHORS + 1])
 def test_geometry_is_the_same_in_blocks_of_any_size(monkeypatch, layout, block):
     model = make_model(counts_with(ROWS, 0, 3), layout=layout)
@@ -87,7 +87,7 @@ def test_geometry_is_the_same_in_blocks_of_any_size(monkeypatch, layout, block):
         np.testing.assert_allclose(found, exact, atol=2e-6, rtol=1e-5)
 
 
-@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("layout", ["paired", "separate", "shallow"])
 def test_parts_of_a_frame_together_are_the_frame(monkeypatch, layout):
     model = make_model(counts_with(ROWS, 0, 3), layout=layout)
     whole = model.gaussians(CAMERA)
@@ -98,7 +98,7 @@ def test_parts_of_a_frame_together_are_the_frame(monkeypatch, layout):
         assert np.array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(whole, name))
 
 
-@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("layout", ["paired", "separate", "shallow"])
 def test_an_anchor_at_the_camera_has_finite_colors(layout):
     center = torch.tensor(CAMERA.center, dtype=torch.float32)
     model = make_model(torch.full((3,), 5), positions=center.repeat(3, 1), layout=layout)

@@ -50,14 +50,14 @@ def example() -> Content:
     )
 
 
-def test_the_document_names_the_networks_of_both_layouts() -> None:
+def test_the_document_names_the_networks_of_every_layout() -> None:
     rows = re.findall(
-        r"^\| \d (separate|paired) \| `(\w+)` \| ([fvg, ]+) \| ([DG4 +]+) \| (\d+) \| (\d+) \|$",
+        r"^\| \d (separate|paired|shallow) \| `(\w+)` \| ([fvg, ]+) \| ([DG4 +]+) \| (\d+) \| (\d+) \|$",
         DOCUMENT,
         re.MULTILINE,
     )
     d, g, h = 5, 3, 7
-    found: dict[str, dict[str, tuple[int, ...]]] = {"separate": {}, "paired": {}}
+    found: dict[str, dict[str, tuple[int, ...]]] = {"separate": {}, "paired": {}, "shallow": {}}
     for layout, network, inputs, size, outputs, blocks in rows:
         count = sum({"D": d, "4": 4, "G": g}[part] for part in size.split(" + "))
         assert count == sum({"f": d, "v": 4, "g": g}[part] for part in inputs.split(", "))

@@ -56,7 +56,7 @@ def predicted(trainer: Trainer) -> tuple[torch.Tensor, ...]:
     return g.means, g.scales, g.opacities, g.colors
 
 
-@pytest.mark.parametrize("heads", ["paired", "separate"])
+@pytest.mark.parametrize("heads", ["paired", "separate", "shallow"])
 @pytest.mark.parametrize(("residuals", "context"), [(True, "hyperprior"), (False, "neighbours")])
 def test_without_rounding_the_scene_stays_the_same(
     blob_scene: Scene, tiny_config: Config, heads: str, residuals: bool, context: str
@@ -236,7 +236,7 @@ def test_fewer_anchors_than_channels_are_no_trouble(blob_scene: Scene, tiny_conf
         assert np.isfinite(sum(trainer.model.estimated_bits().values()))
 
 
-@pytest.mark.parametrize("heads", ["paired", "separate"])
+@pytest.mark.parametrize("heads", ["paired", "separate", "shallow"])
 @pytest.mark.parametrize("residuals", [True, False])
 def test_a_channel_that_is_the_same_everywhere_can_go_without_a_change(
     blob_scene: Scene, tiny_config: Config, heads: str, residuals: bool
@@ -292,7 +292,7 @@ def test_the_channels_that_stay_keep_their_means_and_scales(blob_scene: Scene, t
     assert torch.equal(trainer.optimizer.state[network.weights[-1]]["exp_avg"], moments[rows])
 
 
-@pytest.mark.parametrize("heads", ["paired", "separate"])
+@pytest.mark.parametrize("heads", ["paired", "separate", "shallow"])
 def test_with_fewer_channels_a_model_looks_in_memory_as_it_does_from_its_file(
     blob_scene: Scene, tiny_config: Config, tmp_path: Path, heads: str
 ) -> None:

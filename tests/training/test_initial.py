@@ -20,12 +20,12 @@ from compgs.training.plan import grid_spacings
 from compgs.training.start import initial_model
 
 
-@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("layout", ["paired", "separate", "shallow"])
 def test_before_anything_is_learned_references_pass_as_color_logits(layout: str) -> None:
     heads = make_heads(layout, HeadDimensions(8, 4, 16))
     mean = torch.tensor([0.5, -1.0, 0.25])
     heads.pass_colors(mean)
-    network = heads.appearance if layout == "paired" else heads.color
+    network = heads.color if layout == "separate" else heads.appearance
     features = torch.randn(7, 12)
     with torch.no_grad():
         network.output_weight.zero_()  # the hidden layers; only the skip is left

@@ -76,7 +76,7 @@ def valueless_views(views, monkeypatch):
     return views
 
 
-@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("layout", ["paired", "separate", "shallow"])
 @pytest.mark.parametrize("progress", [0.0, 0.15, 0.75])
 def test_a_step_needs_no_value_but_which_anchors_are_in_view(
     blob_scene, tiny_config, monkeypatch, layout, progress

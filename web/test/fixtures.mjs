@@ -28,6 +28,10 @@ const HEADS = {
     ["geometry", 1],
     ["appearance", 1],
   ],
+  shallow: [
+    ["geometry", 0],
+    ["appearance", 0],
+  ],
 };
 const OUTER = ["input_weight", "input_bias", "output_weight", "output_bias", "skip_weight"];
 

@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
@@ -39,7 +38,7 @@ from compgs.codec.tables import FrequencyTables, HyperTable, channel_tables, gau
 from compgs.codec.viewpoints import Viewpoints
 from compgs.codec.weights import QuantizedTensor
 from compgs.model.constants import SHARED_RESIDUALS
-from compgs.model.head_weights import HeadDimensions, weight_shapes
+from compgs.model.head_weights import HeadDimensions, Layout, weight_shapes
 from compgs.numerics.compiled import chunk_of, njit, rows_a_thread
 from compgs.ordering.neighbours import BESIDES, Neighbours, find_neighbours
 from compgs.ordering.order import level_counts, octree_depth, octree_origin
@@ -94,7 +93,7 @@ class Dimensions:
 
     coupled_primitives: int  # K, slots per anchor; the mask says which exist
     residual_dim: int  # channels of a residual embedding, whether coded or in the heads
-    heads: Literal["separate", "paired"]  # layout of the prediction networks
+    heads: Layout  # layout of the prediction networks
     width: int  # hidden width of the prediction networks
     groups: tuple[GroupShape, ...]
 
@@ -154,7 +153,7 @@ class FileContent:
 
     coupled_primitives: int
     residual_dim: int
-    heads_layout: Literal["separate", "paired"]
+    heads_layout: Layout
     width: int
     voxel_size: float  # world units between neighbouring coordinates
     world_offset: tuple[float, float, float]  # world units: where coordinates (0, 0, 0) are

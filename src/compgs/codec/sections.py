@@ -4,7 +4,6 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import starmap
-from typing import Literal
 
 import numpy as np
 
@@ -29,8 +28,9 @@ from compgs.codec.format import (
 from compgs.codec.tables import LEVELS, MAX_HYPER_SYMBOLS, MAX_LOWEST, MAX_TABLES, HyperTable
 from compgs.codec.weights import decode_arrays, encode_arrays
 from compgs.errors import CorruptSection
+from compgs.model.head_weights import Layout
 
-HEADS: tuple[Literal["separate", "paired"], ...] = ("separate", "paired")  # their numbers in the file
+HEADS: tuple[Layout, ...] = ("separate", "paired", "shallow")  # their numbers in the file
 # anchors, coupled primitives that exist | K, residual_dim, heads, width | voxel_size, world_offset,
 # view_distance_scale | background
 SCENE_LAYOUT = "<II BBBH ddddd fff"
@@ -89,6 +89,7 @@ def version_for(content: FileContent) -> int:
     """
     if content.angular_dilation is not None:
         return FIRST_WITH_ROWS
+    assert content.dimensions.heads != "shallow", "heads that a scene of an old file cannot have"
     sees_neighbours = any(group.shape.sees_neighbours for group in content.groups)
     return FIRST_WITH_NEIGHBOURS if sees_neighbours else OLDEST_VERSION
 
@@ -107,8 +108,9 @@ def decode_scene(data: bytes, section: str, version: int) -> SceneSection:
         raise CorruptSection(f"{section}: {anchors} anchors, expected 1 to {MAX_ANCHORS}")
     if coupled > anchors * k:
         raise CorruptSection(f"{section}: {coupled} coupled primitives, expected at most {k} for each anchor")
-    if heads >= len(HEADS):
-        raise CorruptSection(f"{section}: heads are {heads}, expected 0 to {len(HEADS) - 1}")
+    most = len(HEADS) - 1 if version >= FIRST_WITH_ROWS else HEADS.index("paired")
+    if heads > most:
+        raise CorruptSection(f"{section}: heads are {heads}, expected 0 to {most}")
     dilation: float | None = None
     if version >= FIRST_WITH_DILATION:
         (dilation,) = reader.struct(DILATION_LAYOUT, "angular_dilation")

@@ -10,7 +10,7 @@ from compgs.model.arrays import MLPArrays
 from compgs.model.constants import VIEW_DIM
 from compgs.model.inference import HeadArrays, PairedArrays, SeparateArrays
 
-Layout = Literal["paired", "separate"]
+Layout = Literal["separate", "paired", "shallow"]
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,15 @@ class NetworkShape:
 
 
 # Of each layout, in the order of the file. Outputs: opacity and color; translation, scaling and quaternion.
-NETWORKS: dict[str, dict[str, NetworkShape]] = {
-    "paired": {"geometry": NetworkShape(False, 10, 1), "appearance": NetworkShape(True, 4, 1)},
+NETWORKS: dict[Layout, dict[str, NetworkShape]] = {
     "separate": {
         "translation": NetworkShape(False, 3, 1),
         "covariance": NetworkShape(False, 7, 1),
         "opacity": NetworkShape(True, 1, 1),
         "color": NetworkShape(True, 3, 2),
     },
+    "paired": {"geometry": NetworkShape(False, 10, 1), "appearance": NetworkShape(True, 4, 1)},
+    "shallow": {"geometry": NetworkShape(False, 10, 0), "appearance": NetworkShape(True, 4, 0)},
 }
 
 
@@ -78,7 +79,7 @@ class HeadWeights:
             MLPArrays.of(self._of(network), shape.anchor_dim(self.dimensions.reference))
             for network, shape in NETWORKS[self.layout].items()
         ]
-        return PairedArrays(*networks) if self.layout == "paired" else SeparateArrays(*networks)
+        return SeparateArrays(*networks) if self.layout == "separate" else PairedArrays(*networks)
 
     def _of(self, network: str) -> dict[str, np.ndarray]:
         """The weights of a network, without its name in front of theirs."""

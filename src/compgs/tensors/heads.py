@@ -3,7 +3,8 @@
     t_k = phi(f, g_k)    S_k = psi(f, g_k), R_k = varphi(f, g_k)    alpha_k = kappa(v, f, g_k)    c_k = zeta(v, f, g_k)
 
 are either separate networks (the paper), or paired into one for geometry and one for appearance, which halves weights
-and time. `make_heads` chooses, once; names of parameters are those of docs/bitstream_prediction.md.
+and time, or paired without residual blocks (shallow), which takes a third of the time. `make_heads` chooses, once;
+names of parameters are those of docs/bitstream_prediction.md.
 """
 
 from abc import abstractmethod
@@ -63,7 +64,7 @@ class PredictionHeads(Heads):
 class PairedHeads(PredictionHeads):
     """Two networks: geometry (10 outputs) and appearance (opacity and color)."""
 
-    layout = "paired"
+    layout: Layout = "paired"
 
     def __init__(self, dimensions: HeadDimensions) -> None:
         super().__init__(dimensions)
@@ -103,6 +104,12 @@ class PairedHeads(PredictionHeads):
         return Prediction(Gaussians(means, quaternions, scales, shown, colors), index, opacities)
 
 
+class ShallowHeads(PairedHeads):
+    """The same with a single hidden layer each."""
+
+    layout: Layout = "shallow"
+
+
 class SeparateHeads(PredictionHeads):
     """Four networks, as in the paper: translation, covariance (scaling and quaternion), opacity, color."""
 
@@ -134,8 +141,9 @@ class SeparateHeads(PredictionHeads):
 
 
 LAYOUTS: dict[str, type[PairedHeads] | type[SeparateHeads]] = {
-    "paired": PairedHeads,
     "separate": SeparateHeads,
+    "paired": PairedHeads,
+    "shallow": ShallowHeads,
 }
 
 
@@ -157,7 +165,7 @@ def heads_of(weights: HeadWeights) -> PredictionHeads:
 
 
 def make_heads(layout: str, dimensions: HeadDimensions) -> PredictionHeads:
-    """New heads of a layout of the configuration or of a file: "paired" or "separate"."""
+    """New heads of a layout of the configuration or of a file: "separate", "paired" or "shallow"."""
     return LAYOUTS[layout](dimensions)
 
 

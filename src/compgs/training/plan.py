@@ -14,9 +14,9 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-from compgs.config import MAX_VIEWPOINTS, MOST_COUPLED, Config, ModelConfig
+from compgs.config import MAX_VIEWPOINTS, MOST_COUPLED, Config, Heads, ModelConfig
 from compgs.errors import ConfigError
 from compgs.former_settings import FORMER_RULES
 from compgs.render.settings import LEAST_DILATION
@@ -290,7 +290,7 @@ class Plan:
     # the model
     coupled_primitives: int  # K
     width: int  # hidden units of the prediction networks
-    heads: Literal["separate", "paired"]
+    heads: Heads
     residuals: bool  # each anchor has its own K residual embeddings
     reference_context: Literal["neighbours", "hyperprior", "none"]
     row_context: bool  # of the file: symbols say something about later ones of their row
@@ -489,7 +489,7 @@ def _expected(plan: Plan) -> dict[str, tuple[bool, str]]:
     return {
         "coupled_primitives": whole("coupled_primitives", 1, MOST_COUPLED),
         "width": whole("width", 1, 256),
-        "heads": one_of("heads", "separate", "paired"),
+        "heads": one_of("heads", *get_args(Heads)),
         "residuals": one_of("residuals", True, False),
         "reference_context": one_of("reference_context", "neighbours", "hyperprior", "none"),
         "row_context": one_of("row_context", True, False),

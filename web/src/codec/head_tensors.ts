@@ -24,6 +24,10 @@ export const HEAD_LAYOUTS: Record<SceneSection["heads"], Record<string, HeadLayo
     geometry: { seesView: false, outputs: 10, blocks: 1 },
     appearance: { seesView: true, outputs: 4, blocks: 1 },
   },
+  shallow: {
+    geometry: { seesView: false, outputs: 10, blocks: 0 },
+    appearance: { seesView: true, outputs: 4, blocks: 0 },
+  },
 };
 
 export interface TensorShape {

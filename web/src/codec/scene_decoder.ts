@@ -23,7 +23,7 @@ import { checkPadding, readMetadata } from "./metadata.ts";
 import { EarlierAnchors } from "./neighbours.ts";
 import { type IntegerNetwork, readNetworks } from "./networks.ts";
 import { readPositions } from "./positions.ts";
-import { type GroupShape, type SceneSection, readScene } from "./scene_section.ts";
+import { type GroupShape, type HeadsName, type SceneSection, readScene } from "./scene_section.ts";
 import { type FrequencyTables, readTables } from "./tables.ts";
 import { type Viewpoints, readViewpoints } from "./viewpoints.ts";
 
@@ -41,7 +41,7 @@ export interface Scene {
   coupledPrimitives: number;
   residualDim: number;
   referenceDim: number;
-  heads: "separate" | "paired";
+  heads: HeadsName;
   width: number;
   /** World units between neighbouring coordinates. */
   voxelSize: number;

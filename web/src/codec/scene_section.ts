@@ -3,6 +3,7 @@
 import {
   FIRST_WITH_DILATION,
   FIRST_WITH_NEIGHBOURS,
+  FIRST_WITH_ROWS,
   LARGEST,
   LARGEST_DILATION,
   LOG_SCALES,
@@ -21,6 +22,10 @@ import { FieldReader } from "./fields.ts";
 import { NEIGHBOUR_INPUTS } from "./neighbours.ts";
 
 export const Role = { side: 0, reference: 1, logScales: 2, residual: 3 } as const;
+
+/** Layouts of the prediction heads, by their numbers in the file. */
+const HEADS = ["separate", "paired", "shallow"] as const;
+export type HeadsName = (typeof HEADS)[number];
 
 const CHANNEL_LIMITS = [MAX_SIDE_DIM, MAX_REFERENCE_DIM, LOG_SCALES, MAX_RESIDUAL_DIM];
 
@@ -50,7 +55,7 @@ export interface SceneSection {
   coupledPrimitives: number;
   residualDim: number;
   referenceDim: number;
-  heads: "separate" | "paired";
+  heads: HeadsName;
   width: number;
   voxelSize: number;
   worldOffset: [number, number, number];
@@ -78,7 +83,8 @@ export function readScene(payload: Uint8Array, name: string, version: number): S
   );
   between("coupled", coupled, 0, anchors * coupledPrimitives);
   const residualDim = between("residual_dim", reader.u8("residual_dim"), 1, MAX_RESIDUAL_DIM);
-  const heads = between("heads", reader.u8("heads"), 0, 1) === 0 ? "separate" : "paired";
+  const mostHeads = version < FIRST_WITH_ROWS ? HEADS.indexOf("paired") : HEADS.length - 1;
+  const heads = HEADS[between("heads", reader.u8("heads"), 0, mostHeads)]!;
   const width = between("width", reader.u16("width"), 1, MAX_WIDTH);
   const voxelSize = between("voxel_size", reader.f64("voxel_size"), SMALLEST, LARGEST);
   const offset = () => upTo("world_offset", reader.f64("world_offset"));

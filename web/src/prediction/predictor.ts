@@ -47,10 +47,10 @@ export class Predictor {
     const { networks, sharedResiduals } = readHeadNetworks(scene);
     this.primitives = coupledPrimitives(scene, sharedResiduals);
     this.positions = Float32Array.from(scene.coordinates, (c) => c * scene.voxelSize);
-    const names = scene.heads === "paired" ? ["geometry"] : ["translation", "covariance"];
+    const names = scene.heads === "separate" ? ["translation", "covariance"] : ["geometry"];
     const geometryParts = names.map((name) => new CoupledMLP(networks[name]!, this.primitives, kernels));
     this.geometry = predictGeometry(scene, this.primitives, this.positions, geometryParts);
-    const seen = scene.heads === "paired" ? ["appearance"] : ["opacity", "color"];
+    const seen = scene.heads === "separate" ? ["opacity", "color"] : ["appearance"];
     this.appearanceParts = seen.map((name) => new CoupledMLP(networks[name]!, this.primitives, kernels));
     this.views = new Float32Array(4 * scene.anchors);
     this.raw = this.appearanceParts.map((part) => new Float32Array(scene.coupled * part.network.outputs));
