@@ -469,7 +469,7 @@ static void cgs__read_scene(cgs__decoder *d) {
     cgs__require(d, d->promised_coupled <= s->total_anchors * (uint64_t)s->coupled_primitives,
                  "more coupled primitives than slots");
     s->residual_dim = cgs__int(&f, 1, 1, 64, "residual_dim");
-    s->heads = cgs__int(&f, 1, 0, s->version < CGS__FIRST_WITH_ROWS ? 1 : 2, "heads");
+    s->heads = cgs__int(&f, 1, 0, 2, "heads");
     s->width = cgs__int(&f, 2, 1, 1024, "width");
     s->voxel_size = cgs__real(&f, 8, small, large, "voxel_size");
     for (int i = 0; i < 3; i++) s->world_offset[i] = cgs__real(&f, 8, -large, large, "world_offset");

@@ -428,7 +428,6 @@ def _heads(add: Callable, sections: Sections, old: Sections) -> None:
     more = [*tensors, QuantizedTensor(np.ones((2, 2), np.int32), 3)]
     add("heads_more", put(sections, HEADS, encode_known_heads(more)), "one tensor too many")
     add("heads_longer", put(sections, HEADS, lambda data: data + b"\0"), "a byte after the low parts")
-    add("heads_2_in_2", pack(put(old, SCENE, at(LAYOUT, b"\2")), 2), "heads 2 in version 2", ours_alone=True)
     named = list(read_content(pack(old, 2)).heads)
 
     def with_names(name: str, why: str, heads: list[tuple[str, QuantizedTensor]]) -> None:

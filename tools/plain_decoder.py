@@ -241,7 +241,7 @@ def read_scene(data: bytes, version: int) -> Scene:
     k = fields.number("B", 1, MAX_COUPLED_PRIMITIVES, "coupled_primitives")
     fields.require(coupled <= anchors * k, f"{coupled} coupled primitives in {anchors * k} slots")
     residual_dim = fields.number("B", 1, MAX_RESIDUAL_DIM, "residual_dim")
-    heads = fields.number("B", 0, 2 if version >= FIRST_WITH_ROWS else 1, "heads")
+    heads = fields.number("B", 0, 2, "heads")
     width = fields.number("H", 1, MAX_WIDTH, "width")
     voxel_size = fields.number("d", SMALLEST, LARGEST, "voxel_size")
     world_offset = tuple(fields.number("d", -LARGEST, LARGEST, "world_offset") for _ in range(3))

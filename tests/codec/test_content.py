@@ -110,7 +110,7 @@ dimensions = st.builds(
     make_dimensions,
     coupled_primitives=st.integers(1, 12),
     groups=chains(),
-    heads=st.sampled_from(["separate", "paired"]),
+    heads=st.sampled_from(["separate", "paired", "shallow"]),
     width=st.integers(1, 64),
     residual_dim=st.integers(1, 9),
 )

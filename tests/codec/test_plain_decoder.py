@@ -123,7 +123,7 @@ def random_content(seed: int) -> FileContent:
     """
     rng = np.random.default_rng(seed)
     dilation = DILATION if seed % 2 else None
-    heads: Heads = "shallow" if seed % 4 == 1 else "paired"
+    heads: Heads = "shallow" if seed % 3 == 1 else "paired"
     slots = int(rng.integers(1, 5))
     anchors = int(rng.choice([1, 2, 5, 12, 24]))
     content = make_content(

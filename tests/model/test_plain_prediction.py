@@ -53,15 +53,10 @@ def dimensions(name: str, *, own_residuals: bool) -> Dimensions:
     return make_dimensions(k, groups, layout, width, residual)
 
 
-def dilated(d: Dimensions) -> dict[str, float]:
-    """What makes a file one of version 5, where its heads need that."""
-    return {"angular_dilation": 2.0**-10} if d.heads == "shallow" else {}
-
-
 def made(name: str, *, own_residuals: bool, anchors: int = 60) -> Content:
     """Made-up content; some anchors have no coupled primitive at all."""
     d = dimensions(name, own_residuals=own_residuals)
-    content, latents = read_latents(write_content(make_content(anchors, 5, d, kept=0.4, **dilated(d))))
+    content, latents = read_latents(write_content(make_content(anchors, 5, d, kept=0.4)))
     heads = make_heads(np.random.default_rng(10), d)
     assert not content.mask.any(1).all()
     return plain_content(replace(content, heads=heads), latents)
@@ -126,7 +121,7 @@ def test_a_model_predicts_what_the_document_says(name: str, own_residuals: bool)
 @pytest.mark.parametrize("name", ["paired", "separate", "shallow"])
 def test_a_decoded_file_predicts_what_the_document_says(tmp_path: Path, name: str) -> None:
     d = dimensions(name, own_residuals=True)
-    made = replace(make_content(80, 7, d, kept=0.5, **dilated(d)), heads=make_heads(np.random.default_rng(8), d))
+    made = replace(make_content(80, 7, d, kept=0.5), heads=make_heads(np.random.default_rng(8), d))
     made = replace(made, voxel_size=0.375, view_distance_scale=7.0)
     path = tmp_path / "made.cgs"
     path.write_bytes(write_content(made))

@@ -89,7 +89,6 @@ def version_for(content: FileContent) -> int:
     """
     if content.angular_dilation is not None:
         return FIRST_WITH_ROWS
-    assert content.dimensions.heads != "shallow", "heads that a scene of an old file cannot have"
     sees_neighbours = any(group.shape.sees_neighbours for group in content.groups)
     return FIRST_WITH_NEIGHBOURS if sees_neighbours else OLDEST_VERSION
 
@@ -108,9 +107,8 @@ def decode_scene(data: bytes, section: str, version: int) -> SceneSection:
         raise CorruptSection(f"{section}: {anchors} anchors, expected 1 to {MAX_ANCHORS}")
     if coupled > anchors * k:
         raise CorruptSection(f"{section}: {coupled} coupled primitives, expected at most {k} for each anchor")
-    most = len(HEADS) - 1 if version >= FIRST_WITH_ROWS else HEADS.index("paired")
-    if heads > most:
-        raise CorruptSection(f"{section}: heads are {heads}, expected 0 to {most}")
+    if heads >= len(HEADS):
+        raise CorruptSection(f"{section}: heads are {heads}, expected 0 to {len(HEADS) - 1}")
     dilation: float | None = None
     if version >= FIRST_WITH_DILATION:
         (dilation,) = reader.struct(DILATION_LAYOUT, "angular_dilation")

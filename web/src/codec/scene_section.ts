@@ -3,7 +3,6 @@
 import {
   FIRST_WITH_DILATION,
   FIRST_WITH_NEIGHBOURS,
-  FIRST_WITH_ROWS,
   LARGEST,
   LARGEST_DILATION,
   LOG_SCALES,
@@ -83,8 +82,7 @@ export function readScene(payload: Uint8Array, name: string, version: number): S
   );
   between("coupled", coupled, 0, anchors * coupledPrimitives);
   const residualDim = between("residual_dim", reader.u8("residual_dim"), 1, MAX_RESIDUAL_DIM);
-  const mostHeads = version < FIRST_WITH_ROWS ? HEADS.indexOf("paired") : HEADS.length - 1;
-  const heads = HEADS[between("heads", reader.u8("heads"), 0, mostHeads)]!;
+  const heads = HEADS[between("heads", reader.u8("heads"), 0, HEADS.length - 1)]!;
   const width = between("width", reader.u16("width"), 1, MAX_WIDTH);
   const voxelSize = between("voxel_size", reader.f64("voxel_size"), SMALLEST, LARGEST);
   const offset = () => upTo("world_offset", reader.f64("world_offset"));
