@@ -44,7 +44,14 @@ BLOCK = re.compile(
 )
 
 # The records that come first in the tables: the paper's scenes.
-FIRST = ("truck", "truck_adjusted", "truck_adjusted_1e-3", "truck_adjusted_default", "bonsai_default", "bonsai")
+FIRST = (
+    "truck",
+    "truck_adjusted",
+    "truck_adjusted_1e-3",
+    "truck_adjusted_default",
+    "bonsai_default",
+    "bonsai",
+)
 # Of a run, said by its command; all else is the preset's.
 ASKED = ("lmbda", "steps", "seed", "target_bytes")
 Record = dict[str, Any]
