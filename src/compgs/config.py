@@ -101,7 +101,7 @@ class ModelConfig:
     # training pays for each symbol by itself)
     row_context: bool = True
     # separate: four networks (Sec. 3.2); paired: geometry, appearance; shallow: these without residual blocks
-    heads: Heads = "shallow"
+    heads: Heads = "paired"
     # world units between neighbouring anchors; none: `voxel_spacings` decides
     voxel_size: Annotated[float | None, Range(0, above=True)] = None
     # size of a voxel, in median distances between neighbouring points, if `voxel_size` is none

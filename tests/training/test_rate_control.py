@@ -98,7 +98,7 @@ def test_the_share_that_is_left_is_that_of_all_prunings_to_come(blob_scene, tiny
         expected = FileSize(model).latents() / before
         model.mask = torch.ones_like(model.mask)
         assert found[step] == pytest.approx(expected, rel=0.005), step
-    assert found[5] == found[10] < 0.99 * found[11] < 0.8 * found[21] < 0.8
+    assert found[5] == found[10] < 0.98 * found[11] < 0.8 * found[21] < 0.8
 
 
 @pytest.mark.parametrize(("target", "limit"), [(1e3, HIGHEST), (1e7, LOWEST)])
@@ -115,7 +115,7 @@ def longer(tiny_config):
     )
 
 
-@pytest.mark.parametrize("target", [3700, pytest.param(4200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("target", [4600, pytest.param(5100, marks=pytest.mark.slow)])
 def test_one_training_gives_a_file_of_the_size_that_was_asked_for(blob_scene, longer, tmp_path, target):
     config = replace(longer, training=replace(longer.training, target_bytes=target))
     trainer = Trainer(blob_scene, config, CPU)
