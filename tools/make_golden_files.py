@@ -103,8 +103,8 @@ KEPT = (*TRAINED, *FOREIGN, "dilated")
 
 def contents() -> dict[str, tuple[FileContent, list[int] | None]]:
     """Content and levels of the ranges, by name: the smallest sensible file, one as the default preset makes it, one as
-    it made small ones, one as the paper's preset does, one with neighbours, one whose rows say something, one whose
-    heads are shallow, one with everything unusual, one of several chunks.
+    it makes small ones, one as the paper's preset does, one with neighbours, one as training writes them, whose rows
+    say something, one whose heads are shallow, one with everything unusual, one of several chunks.
     """
     tiny = make_content(3, 1, make_dimensions(2, paper_groups(2, 0, 1), width=2, residual_dim=2), kept=0.7)
     default = make_content(800, 2, make_dimensions(5, paper_groups(12, 0)))

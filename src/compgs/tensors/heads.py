@@ -3,7 +3,7 @@
     t_k = phi(f, g_k)    S_k = psi(f, g_k), R_k = varphi(f, g_k)    alpha_k = kappa(v, f, g_k)    c_k = zeta(v, f, g_k)
 
 are either separate networks (the paper), or paired into one for geometry and one for appearance, which halves weights
-and time, or paired without residual blocks (shallow), which takes a third of the time. `make_heads` chooses, once;
+and time, or paired without residual blocks (shallow), which takes six tenths. `make_heads` chooses, once;
 names of parameters are those of docs/bitstream_prediction.md.
 """
 
