@@ -17,6 +17,7 @@ const RESIDUAL = 3;
 const NETWORKS = {
   separate: { translation: 1, covariance: 1, opacity: 1, color: 2 },
   paired: { geometry: 1, appearance: 1 },
+  shallow: { geometry: 0, appearance: 0 },
 };
 
 const ACTIONS = {
