@@ -67,6 +67,7 @@ def study(tmp_path: Path, trainings: Trainings, name: str, *more: str) -> str:
     return (tmp_path / "out" / f"ablation_{name}_scene.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_finished_variant_is_not_run_again_unless_its_settings_change(tmp_path: Path) -> None:
     trainings = Trainings()
     first = study(tmp_path, trainings, "bitstream", "--seeds", "0", "1", "--steps", "60")

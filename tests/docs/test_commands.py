@@ -49,6 +49,16 @@ def commands() -> list[tuple[str, str]]:
     return [(page, command) for command, page in found.items()]
 
 
+def cases() -> list[Any]:
+    """`commands`; those of other pages than the README take a minute together, and the complete run has them."""
+    return [
+        pytest.param(
+            page, command, id=f"{page}-{command}"[:80], marks=() if page == "README.md" else pytest.mark.slow
+        )
+        for page, command in commands()
+    ]
+
+
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What somebody who follows the documentation has after a while."""
@@ -141,7 +151,7 @@ def _in_view() -> bool:
     return any(frame.filename.endswith("cli/view.py") for frame in inspect.stack(0)[2:4])
 
 
-@pytest.mark.parametrize(("page", "command"), commands(), ids=lambda value: str(value)[:80])
+@pytest.mark.parametrize(("page", "command"), cases())
 def test_a_command_of_the_documentation_works(
     page: str, command: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

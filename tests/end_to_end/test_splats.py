@@ -81,6 +81,7 @@ def test_evaluating_and_rendering_the_file_again_gives_the_same(
     assert len(list((tmp_path / "orbit").glob("*.png"))) == 2
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_continues_to_the_same_file(
     run: Path,
     scene_folder: Path,

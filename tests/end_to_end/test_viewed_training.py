@@ -11,6 +11,7 @@ pytest.importorskip("viser")
 OPTIONS = ["--preset", "quick", "--steps", "30", "--no-eval", "--device", "cpu"]
 
 
+@pytest.mark.slow
 def test_a_viewed_training_writes_the_same_file_and_says_where_to_look(
     scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

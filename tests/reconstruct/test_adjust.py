@@ -143,6 +143,7 @@ def test_photographs_are_compared_with_near_ones_that_look_the_same_way(
     assert {(0, 1), (3, 4), (5, 6)} <= set(pairs)
 
 
+@pytest.mark.slow
 def test_the_command_line_says_what_came_of_it(
     walls: Walls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

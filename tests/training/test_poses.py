@@ -100,7 +100,7 @@ def seen(camera, scene: Scene) -> np.ndarray:
     return np.stack([camera.fx * x / z, camera.fy * y / z], axis=1)
 
 
-@pytest.mark.parametrize("kind", [Trainer, SplatTrainer])
+@pytest.mark.parametrize("kind", [Trainer, pytest.param(SplatTrainer, marks=pytest.mark.slow)])
 def test_poses_that_were_put_off_are_found_again(blob_scene, tiny_config, kind) -> None:
     scene = shaken(blob_scene)
     training = replace(tiny_config.training, steps=400, lmbda=0.0, poses="on")

@@ -123,6 +123,7 @@ def test_one_training_gives_a_file_of_the_size_that_was_asked_for(blob_scene, lo
     assert encode(trainer.model, tmp_path / "a.cgs").bytes == pytest.approx(target, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_run_that_seeks_a_size_continues_exactly_and_needs_no_display(blob_scene, tiny_config, tmp_path):
     config = replace(tiny_config, training=replace(tiny_config.training, target_bytes=6000))
     whole = Trainer(blob_scene, config, CPU)
