@@ -204,8 +204,9 @@ def test_damaged_content_is_refused(trainer: SplatTrainer, tmp_path: Path) -> No
             splats_of(damaged(**{name: array}))
     path = tmp_path / "b.packed"
     write_packed(path, damaged(quaternions_codes=np.zeros_like(whole.arrays["quaternions_codes"])))
+    # How many there are depends on the processor's last bits.
     with pytest.raises(
-        SplatFileError, match="4,660 of 4,660 splats cannot be drawn: 4,660 without a rotation"
+        SplatFileError, match=r": ([\d,]+) of \1 splats cannot be drawn: \1 without a rotation"
     ):
         open_scene(path)
 
