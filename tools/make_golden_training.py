@@ -51,6 +51,7 @@ CONFIG = Config(
         steps=60,
         seed=11,
         target_bytes=2_200,
+        ssim_weight=0.2,
         # Which anchors are hidden depends on the last bit of their gradients.
         rules="all but hidden_anchors",
         phases=Phases(rate=0.05, symbols=0.75),

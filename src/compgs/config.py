@@ -198,8 +198,8 @@ class TrainingConfig:
     # loss (Ref.: 3 000 of 30 000 steps); the likelihood sees symbols, not noise (soft then hard); the networks train
     # with the weights of the file; the mean begins that the file holds (not in the paper; 1: no mean)
     phases: Annotated[tuple[float, float, float, float, float], Range(0, 1)] = Phases()
-    # (1 - w) L1 + w (1 - SSIM) (3DGS)
-    ssim_weight: Share = 0.2
+    # w of (1 - w) L1 + w (1 - SSIM) (3DGS: 0.2, which plain 3DGS and what builds on it have here)
+    ssim_weight: Share = 0.4
     # weight of the mean product of the primitives' scales, see `losses.scale_unit` (Ref.)
     scale_weight: Annotated[float, Range(0, 1e6, below=True)] = 0.01
     # learning rate of the embeddings at the start and at the end, in quantization steps per training step

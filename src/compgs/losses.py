@@ -29,6 +29,7 @@ from compgs.numerics.ssim import l1_and_ssim
 from compgs.tensors import where
 from compgs.tensors.ssim import ssim
 
+SSIM_WEIGHT = 0.2  # w of 3DGS, and of the published methods that build on it
 COMMON_EXTENT = 5.0  # world units
 # With a smaller share of a view's primitives drawn, the scene is about to vanish: what is not drawn has no gradient.
 FEW_DRAWN = 0.1
@@ -71,7 +72,7 @@ def as_taken(image: Tensor, target: Target) -> Tensor:
 def photometric_loss(
     image: Tensor,  # [H, W, 3] rendered, 0 to 1
     target: Target | Tensor,  # [H, W, 3] uint8, or of the image's type and 0 to 1
-    ssim_weight: float = 0.2,
+    ssim_weight: float = SSIM_WEIGHT,
 ) -> Tensor:
     """(1 - w) L1 + w (1 - SSIM), as in 3DGS, as the target's camera shows the image; means over its pixels
     that count (`numerics/ssim.py`).

@@ -32,11 +32,11 @@ def test_presets_steps_seed_and_settings_of_its_own_apply_to_3dgs() -> None:
         "--set",
         "splats.harmonics=1",
         "--set",
-        "training.ssim_weight=0",
+        "training.views_per_step=2",
     ]
     found = settings("-o", "run", "--method", "3dgs", *options)
     assert (found.method, found.config.training.steps, found.config.training.seed) == ("3dgs", 4000, 5)
-    assert (found.config.splats.harmonics, found.config.training.ssim_weight) == (1, 0.0)
+    assert (found.config.splats.harmonics, found.config.training.views_per_step) == (1, 2)
 
 
 @pytest.mark.parametrize(

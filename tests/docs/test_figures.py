@@ -57,6 +57,11 @@ def test_a_row_names_its_commit_exactly_if_the_preset_of_today_would_train_other
         for name, value in now.items()
         if name not in ("start", "reasons")
     ) and not any(record["plan"].get(name) for name in FORMER_RULES)
+    training, judged = record["settings"]["training"], today.training
+    same = same and (training["ssim_weight"], training["scale_weight"]) == (
+        judged.ssim_weight,
+        judged.scale_weight,
+    )
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert (f"{record['page']}), at {record['commit']} |" in readme) == (not same)
 

@@ -27,6 +27,12 @@ CERTAIN = {
 }
 
 
+def distortion_of(trainer: Trainer, l1: float, similarity: float) -> float:
+    """What the image adds to the loss."""
+    w = trainer.config.training.ssim_weight
+    return (1 - w) * l1 + w * (1 - similarity)
+
+
 def with_training(config: Config, **settings: object) -> Config:
     return replace(config, training=replace(config.training, **settings))
 
@@ -108,7 +114,7 @@ def test_the_rate_joins_the_loss_and_symbols_take_the_place_of_noise_at_their_sh
         trainer = started(blob_scene, config, step)
         l1, similarity, _, bits = parts_of_loss(trainer, trainer.scene.train_views[2])
         symbols = 10.0 * 5 / 132 * sum(bits.values())
-        rate = float(trainer.train_step().loss) - 0.8 * l1 - 0.2 * (1 - similarity)
+        rate = float(trainer.train_step().loss) - distortion_of(trainer, l1, similarity)
         found[step] = rate / symbols
     assert abs(found[4]) < 0.01
     assert found[10] == pytest.approx(1, abs=1e-3)
@@ -264,7 +270,7 @@ def test_the_rate_is_in_the_loss_of_every_few_steps_as_many_times(
             trainer = started(blob_scene, config, step)
             trainer.plan = replace(trainer.plan, rate_every=every)
             l1, similarity, _, _ = parts_of_loss(trainer, trainer.scene.train_views[2])
-            found[every, step] = float(trainer.train_step().loss) - 0.8 * l1 - 0.2 * (1 - similarity)
+            found[every, step] = float(trainer.train_step().loss) - distortion_of(trainer, l1, similarity)
     assert found[3, 3] == pytest.approx(3 * found[1, 3], rel=1e-3)
     assert found[1, 3] > 1
     for step in (2, 4):

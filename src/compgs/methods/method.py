@@ -18,7 +18,6 @@ SPLAT_SETTINGS = (
     "training.steps",
     "training.views_per_step",
     "training.seed",
-    "training.ssim_weight",
     "training.exposure",
     "training.poses",
     "training.robust",

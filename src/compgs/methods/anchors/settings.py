@@ -23,7 +23,6 @@ ANCHOR_SETTINGS = (
     "control.variant",
     "training.steps",
     "training.seed",
-    "training.ssim_weight",
     "training.scale_weight",
     "training.log_scale_lr",
     "training.schedule",

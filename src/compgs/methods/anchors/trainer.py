@@ -9,6 +9,7 @@ from torch import Tensor
 from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.errors import ConfigError
+from compgs.losses import SSIM_WEIGHT
 from compgs.methods.anchors.model import AnchorModel, control_settings, initial_anchors
 from compgs.methods.anchors.prediction import AnchorValues, predict_anchors
 from compgs.published.anchors import Frame
@@ -84,7 +85,7 @@ class AnchorTrainer(SceneTrainer):
         shape = self.model.anchors, config.model.coupled_primitives
         self.control = AdaptiveControl(control_settings(config), self.schedule, shape, device)
         self.settings = RasterSettings(background=scene.background)
-        self.pictures = Pictures(self.settings, t.ssim_weight)
+        self.pictures = Pictures(self.settings, SSIM_WEIGHT)
 
     def groups(self) -> dict[str, tuple[list[Tensor], tuple[float, float]]]:
         """Parameters with their first and last learning rate, by a name."""

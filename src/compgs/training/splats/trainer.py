@@ -18,6 +18,7 @@ from compgs.cameras import Camera
 from compgs.config import Config
 from compgs.devices import placed
 from compgs.gaussians import Gaussians
+from compgs.losses import SSIM_WEIGHT
 from compgs.model.splats import SplatModel
 from compgs.render import RasterResult, RasterSettings
 from compgs.scene.views import Scene
@@ -104,7 +105,7 @@ class SplatTrainer(SceneTrainer):
         self.schedule = densify_schedule(config.splats, t.steps, len(scene.train_views), t.views_per_step)
         self.control = DensityControl(config.splats, scene.extent, len(self.parameters), device)
         self.settings = RasterSettings(background=scene.background)
-        self.pictures = Pictures(self.settings, t.ssim_weight)
+        self.pictures = Pictures(self.settings, SSIM_WEIGHT)
 
     def begin(self) -> None:
         """Let the hooks make what depends on the splats: before the first step of a run that is not resumed."""
