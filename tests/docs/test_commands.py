@@ -50,7 +50,7 @@ def commands() -> list[tuple[str, str]]:
 
 
 def cases() -> list[Any]:
-    """`commands`; those of other pages than the README take a minute together, and the complete run has them."""
+    """`commands`; those of other pages than the README are for the complete run."""
     return [
         pytest.param(
             page, command, id=f"{page}-{command}"[:80], marks=() if page == "README.md" else pytest.mark.slow
