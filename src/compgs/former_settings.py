@@ -61,7 +61,10 @@ FORMER = {
     "control.rate_exponent": _of_rule(1 / 3, 0.0, "growth"),
     "control.prune_less": _of_rule(0.5, 0.0, "bit_discount"),
     "training.left_out": _of_rule(0.2, 0.0, "dropout"),
-    "training.coarse_until": _of_rule(0.7, 0.0, "coarse_photographs"),
+    # Until 0.7 of a run when it was a setting. What a run has begun with is in the plan of its checkpoint.
+    "training.coarse_until": Former(
+        (0.7, 0.4, 0.0), "it is 0.4, or off: --set training.rules='all but coarse_photographs'"
+    ),
     "training.rate_every": _of_rule(4, 1, "rate_every"),
     "training.sampled_gradients": Former(None, "all gradients go on"),
     "training.passed_over": _of_rule(0.03, 0.0, "hidden_anchors"),

@@ -139,7 +139,7 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         ({"sightings": 22.0}, "dropout", 0.0),
         ({"sightings": 11.0}, "bit_discount", 0.5),
         ({"processes": 2}, "passed_over", 0.0),
-        ({"pixels": 160_000}, "coarse_until", 0.7),
+        ({"pixels": 160_000}, "coarse_until", 0.4),
         ({"pixels": 159_999}, "coarse_until", 0.0),
         ({"views": 60}, "pruning_views", 48),
         ({"views": 300}, "pruning_views", 150),

@@ -49,7 +49,7 @@ FEW_SIGHTINGS = 11
 # cheaper, as what adds little may be all that one view has.
 FEW_VIEWS_DROPOUT, FEW_VIEWS_DISCOUNT = 0.2, 0.5
 # The shortcuts (`training/shortcuts`). Photographs of so many pixels, and of more, are halved until a share of the run.
-COARSE_PIXELS, COARSE_UNTIL = 160_000, 0.7
+COARSE_PIXELS, COARSE_UNTIL = 160_000, 0.4
 # Steps from one with the rate to the next: latents change little meanwhile, and a step without takes a sixth less time.
 RATE_EVERY = 4
 # Of the mean gradient of a view's primitives: anchors whose primitives have less are passed over.
@@ -257,7 +257,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         "coarse_photographs", "coarse_until", lambda c, s, share: COARSE_UNTIL,
-        "photographs of 160,000 pixels and more: until 0.7 of the run",
+        "photographs of 160,000 pixels and more: until 0.4 of the run",
         lambda s: s.pixels >= COARSE_PIXELS,
         "results/decisions.md",
     ),
