@@ -45,7 +45,7 @@ BLOCK = re.compile(
 
 # The records that come first in the tables: the paper's scenes.
 FIRST = (
-    "truck_adjusted_today",
+    "truck_adjusted_whole",
     "truck",
     "truck_adjusted",
     "truck_adjusted_1e-3",
