@@ -12,7 +12,7 @@ from compgs.scene.views import Scene
 from compgs.training.run.pace import Pace
 from compgs.training.run.status import TrainingStatus
 from compgs.training.run.time_left import TimeLeft, drawing_seconds
-from compgs.training.shortcuts.coarse import halved, halvings, usual_camera
+from compgs.training.shortcuts.coarse import divided, halved, halvings, usual_camera
 from compgs.training.trainer import Trainer
 
 STEPS = 1000
@@ -116,10 +116,10 @@ def test_a_trainers_camera_is_as_large_as_what_its_step_looks_at(
     trainer = Trainer(scene, config, torch.device("cpu"))
     cameras = [view.camera for view in large]
     for progress in (0.0, 0.3, 0.65, 0.9):
-        found = trainer.coarse.usual(cameras, progress)
+        found = trainer.camera_at(round(progress * config.training.steps))
         times = halvings(progress, trainer.plan.coarse_until, 800, 600)
         assert (found.width, found.height) == (800 // 2**times, 600 // 2**times)
-    assert usual_camera(cameras, 4).width == 200
+    assert divided(usual_camera(cameras), 4).width == 200
 
 
 def test_a_status_without_it_counts_steps_at_the_present_pace() -> None:

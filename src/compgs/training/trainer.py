@@ -162,9 +162,8 @@ class Trainer(SceneTrainer):
         return self.rate.lmbda
 
     def camera_at(self, step: int, divisor: int = 1) -> Camera:
-        """Return the camera of a usual training view, as large as a step looks at it."""
-        cameras = [view.camera for view in self.scene.train_views]
-        return self.coarse.usual(cameras, step / self.config.training.steps, divisor)
+        """Return the camera of a usual training view, as large as a step looks at it, with sides divided by so much."""
+        return self.coarse.sized(super().camera_at(step, divisor), step / self.config.training.steps)
 
     def snapshot(self) -> HybridModel:
         """What the file would hold of the scene now; the end of the run takes means, and removes primitives."""

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -23,7 +24,7 @@ from compgs.training.run.restoring import restoring
 from compgs.training.run.run import Run
 from compgs.training.run.seen_points import check_points_seen
 from compgs.training.run.status import StepResult, TrainingStatus
-from compgs.training.shortcuts.coarse import usual_camera
+from compgs.training.shortcuts.coarse import divided, usual_camera
 from compgs.training.step.pictures import Pictures
 from compgs.training.step.views_in_turn import ViewsInTurn
 
@@ -150,9 +151,14 @@ class SceneTrainer(ABC):
         """Raises TrainingError if the ranks of a torchrun have come to hold different scenes."""
         check_identical(self.step, self.held_in_common())
 
+    @cached_property
+    def usual_camera(self) -> Camera:
+        """Return the camera of a training view of the usual size."""
+        return usual_camera([view.camera for view in self.scene.train_views])
+
     def camera_at(self, step: int, divisor: int = 1) -> Camera:
-        """Return the camera of a usual training view, as large as a step looks at it."""
-        return usual_camera([view.camera for view in self.scene.train_views], divisor)
+        """Return the camera of a usual training view, as large as a step looks at it, with sides divided by so much."""
+        return divided(self.usual_camera, divisor)
 
     @abstractmethod
     def snapshot(self) -> Renderable:

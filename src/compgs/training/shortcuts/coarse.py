@@ -38,10 +38,14 @@ def halved(camera: Camera, times: int) -> Camera:
     return camera.resized(*(max(1, round(side / 2**times)) for side in (camera.width, camera.height)))
 
 
-def usual_camera(cameras: Sequence[Camera], divisor: int = 1) -> Camera:
-    """One of the middle one's size, with sides divided by so much."""
+def usual_camera(cameras: Sequence[Camera]) -> Camera:
+    """One of the middle one's size."""
     by_size = sorted(range(len(cameras)), key=lambda i: cameras[i].width * cameras[i].height)
-    camera = cameras[by_size[len(by_size) // 2]]
+    return cameras[by_size[len(by_size) // 2]]
+
+
+def divided(camera: Camera, divisor: int) -> Camera:
+    """The same view with sides divided by so much."""
     if divisor == 1:
         return camera
     return camera.resized(*(max(1, side // divisor) for side in (camera.width, camera.height)))
@@ -56,9 +60,8 @@ class CoarseViews:
         self.cameras: dict[tuple[int, int], Camera] = {}  # by view and halvings
         self.photographs = KeptPhotographs(1 << 29)
 
-    def usual(self, cameras: Sequence[Camera], progress: float, divisor: int = 1) -> Camera:
-        """The camera of a view of the usual size as a step looks at it; with sides divided by so much."""
-        camera = usual_camera(cameras, divisor)
+    def sized(self, camera: Camera, progress: float) -> Camera:
+        """A camera as a step at a `progress` of the run, 0 to 1, looks at it."""
         return halved(camera, halvings(progress, self.until, camera.width, camera.height))
 
     def look(self, view: int, camera: Camera, progress: float) -> tuple[Camera, Target]:

@@ -246,7 +246,7 @@ class SplatTrainer(SceneTrainer):
         self.hooks.finish(self)
 
     def camera_at(self, step: int, divisor: int = 1) -> Camera:
-        """Return the camera of a usual training view, as large as a step looks at it."""
+        """Return the camera of a usual training view, as large as a step looks at it, with sides divided by so much."""
         return self.hooks.sized(super().camera_at(step, divisor), step / self.config.training.steps)
 
     def snapshot(self) -> SplatModel:

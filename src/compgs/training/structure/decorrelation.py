@@ -75,7 +75,7 @@ class ChannelRates:
             return
         before = references.clone()
         yield
-        references.copy_(before.lerp_(references, rates))
+        torch.lerp(before, references, rates, out=references)
 
     def tensors(self) -> dict[str, Tensor]:
         """The rates, for a checkpoint, if there are some."""
