@@ -190,11 +190,11 @@ RULES: tuple[Rule, ...] = (
         lambda s: not s.large and s.often(45) and s.lmbda <= 1e-5,
         "results/decisions.md",
     ),
-    # Fox with lambda 0.001 (a price of 1.2e-7) is better with 32, plush (1.6e-7) with 16.
+    # Plush is better with 32 at a price of 1.6e-7, level at 3.1e-7, and better with 16 at 6.2e-7.
     Rule(
         "width_16", "width", lambda c, s, width: min(width, 16),
-        "lambda / anchors of 1.4e-7 and more",
-        lambda s: s.costs(1.4e-7),
+        "lambda / anchors of 3e-7 and more",
+        lambda s: s.costs(3e-7),
         "results/decisions.md",
     ),
     Rule(
