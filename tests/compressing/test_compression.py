@@ -193,7 +193,20 @@ def test_a_trial_takes_a_part_of_the_time_only(
     assert clock[0] == steps
 
 
-def test_a_run_that_looks_for_points_takes_a_step_as_many_times_as_long_as_it_has_anchors(
+@pytest.mark.parametrize("until", [0.0, 0.4, 1.0])
+def test_a_run_s_pace_is_that_of_coarse_and_whole_photographs_by_their_shares(until: float) -> None:
+    """Steps of 1 s on coarse photographs, 3 s on whole ones; the first ten took a minute."""
+    told, now = [], 60.0
+    for step in range(10, 61):
+        now += 0.0 if step == 10 else 1.0 if step <= until * 60 else 3.0
+        if step % 10 == 0:
+            told.append((step, now))
+    assert pace.mean_pace(told, until, 60) == pytest.approx(until * 1.0 + (1.0 - until) * 3.0)
+    assert pace.mean_pace(told[:2], until, 60) == pytest.approx(3.0 if until == 0 else 1.0)
+    assert pace.mean_pace(told[:1], until, 60) is None
+
+
+def test_a_step_takes_longer_in_a_run_that_looks_for_points(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[Plan] = []

@@ -2,7 +2,9 @@
 
 import contextlib
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from statistics import fmean
 
 from compgs.compressing.deadline import FEWEST
@@ -12,16 +14,18 @@ from compgs.scene.views import Scene
 from compgs.training import Plan, TrainingStatus, plan_for
 from compgs.training.run.run import chosen_device
 
-TRIED = 40  # steps; fewer where these alone would take much of the time
+TRIED = 60  # steps; fewer where these alone would take much of the time
 LEAST_TRIED = 10  # steps
 TRIED_PART = 0.1  # of the time
-TRIED_VIEWS = 12
+# Fewer than the first steps, which do not count: a view is slow when it is looked at for the first time, as nothing is
+# known of what hides there.
+TRIED_VIEWS = 8
 # A step of the whole run, in steps of its beginning: anchors grow, then most of them are pruned, and the rate is always
 # counted in (measured: docs/results/compress.md).
 WHOLE_RUN = 1.0
-# Anchors of a run that looks for points, in those of one that does not (Truck: docs/results/truck.md). Most of a step's
-# time is for prediction, which takes as many times as long.
-WITH_POINTS = 2.0
+# A step of a run that looks for points, in those of a trial that does not: more anchors at first, then pruning. By
+# processor time it was 1.1 on Bonsai and 1.4 to 1.5 on Truck (docs/results/truck.md#what-a-plan-says-beforehand).
+WITH_POINTS = 1.3
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,8 @@ class _Enough(Exception):
 def seconds_per_step(
     scene: Scene, config: Config, device: str | None, plan: Plan, seconds: float = float("inf")
 ) -> float:
-    """Seconds of a step with everything in it, as long as the steps of a run are on average: the first ones look at
-    coarse photographs, as in a whole run. The very first, which loads and compiles kernels, does not count.
+    """Seconds of a step with everything in it, as long as the steps of a run are on average: a part of them looks at
+    coarse photographs. The first ones, in which kernels are loaded and views are new, do not count.
 
     The plan is the whole scene's: the few views that are tried would make another one. No points are looked for, which
     takes minutes; a step of the run takes longer by the anchors that come with them. Of `seconds` the trial takes no
@@ -62,16 +66,34 @@ def seconds_per_step(
     anchors = WITH_POINTS if plan.dense_points > 0 else 1.0
     plan = replace(plan, dense_points=0.0)
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
-    told: list[TrainingStatus] = []
+    told: list[tuple[int, float]] = []  # steps, and when they were done
+    first: list[float] = []
 
     def tell(status: TrainingStatus) -> None:
-        told.append(status)
+        told.append((status.step, time.monotonic()))
+        first.append(status.seconds_per_step)
         if status.step >= LEAST_TRIED and time.monotonic() > end:
             raise _Enough
 
     with contextlib.suppress(_Enough):
         train(replace(scene, train_views=views), trial(config), device=device, progress=tell, plan=plan)
-    return anchors * fmean(status.seconds_per_step for status in told)
+    return anchors * (mean_pace(told, plan.coarse_until, TRIED) or first[0])
+
+
+def mean_pace(told: Sequence[tuple[int, float]], coarse_until: float, steps: int) -> float | None:
+    """Seconds of a step of a run, by when some of a short run's `steps` were done: (step, seconds on a clock), ascending.
+    Both look at coarse photographs until the same share of them. None if fewer than two were told.
+    """
+    coarse, whole = [], []
+    for (before, since), (step, now) in pairwise(told):
+        pace = (now - since) / (step - before)
+        if step <= coarse_until * steps:
+            coarse.append(pace)
+        elif before >= coarse_until * steps:
+            whole.append(pace)
+    if not coarse or not whole:  # a trial that was cut short, or steps of one kind
+        return fmean(coarse or whole) if coarse or whole else None
+    return coarse_until * fmean(coarse) + (1.0 - coarse_until) * fmean(whole)
 
 
 def trial(config: Config) -> Config:

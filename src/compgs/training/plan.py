@@ -26,9 +26,10 @@ from compgs.render.settings import LEAST_DILATION
 USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 # A file of b bytes for each anchor of the beginning comes of a lambda of about 0.04 / b^1.5: fitted to the default
 # preset's curves of docs/results (plush and brighton, 1 500 and 5 000 steps, lambda 0.0001 to 0.1). Sizes are met
-# within a factor of 2 (one standard deviation), at worst 3.5; those of Truck (93 431 anchors; with
-# its points of a sweep they become more than these) and Bonsai within 2.3.
+# within a factor of 2 (one standard deviation), at worst 3.5. Where points are looked for in the photographs, it is
+# about 1.5 / b^2.4: fitted to Truck and Bonsai (lambda 4e-4 to 0.002), which are met within 1.7.
 ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 1.5
+DENSE_ONE_BYTE_LAMBDA, DENSE_SIZE_EXPONENT = 1.5, 2.4
 SIZED_ANCHORS = 1_000, 200_000  # of the beginning, between which that is taken to hold
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
 # two bits of an anchor there, which has a hundred and more. More hidden units do not pay even there.
@@ -397,11 +398,17 @@ def head_bits(config: Config, start: Start, lmbda: float, anchors: int) -> int:
     return int(decided("head_bits", config, replace(start, lmbda=lmbda, anchors=anchors)))
 
 
-def lambda_for(bytes_per_anchor: float) -> float:
-    """lambda that a file of so many bytes for each anchor of the beginning comes of, about. It falls as bytes rise, so
-    that whoever asks for a larger file never gets a smaller model.
+def lambda_for(bytes_per_anchor: float, *, dense: bool = False) -> float:
+    """lambda that a file of so many bytes for each anchor of the beginning comes of, about; `dense`: points are looked
+    for in the photographs. It falls as bytes rise, so that whoever asks for a larger file never gets a smaller model.
     """
-    return ONE_BYTE_LAMBDA * bytes_per_anchor**-SIZE_EXPONENT
+    one_byte, exponent = _size_line(dense)
+    return float(one_byte * bytes_per_anchor**-exponent)
+
+
+def _size_line(dense: bool) -> tuple[float, float]:
+    """lambda of a file of one byte for each anchor, and the exponent by which it falls with more."""
+    return (DENSE_ONE_BYTE_LAMBDA, DENSE_SIZE_EXPONENT) if dense else (ONE_BYTE_LAMBDA, SIZE_EXPONENT)
 
 
 def expected_bytes(start: Start) -> float | None:
@@ -409,7 +416,8 @@ def expected_bytes(start: Start) -> float | None:
     fewest, most = SIZED_ANCHORS
     if start.lmbda <= 0 or not fewest <= start.anchors <= most:
         return None
-    return start.anchors * (ONE_BYTE_LAMBDA / start.lmbda) ** (1 / SIZE_EXPONENT)
+    one_byte, exponent = _size_line(start.dense)
+    return float(start.anchors * (one_byte / start.lmbda) ** (1 / exponent))
 
 
 def active_rules(config: Config) -> tuple[Rule, ...]:

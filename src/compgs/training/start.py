@@ -31,19 +31,21 @@ def start_of(
 ) -> Start:
     """What is known of a run on a scene that begins with so many anchors, before points are looked for."""
     t, cameras = config.training, [view.camera for view in scene.train_views]
-    size = t.target_bytes
-    return Start(
+    start = Start(
         anchors=anchors,
         views=len(cameras),
         sightings=sightings(scene),
         passes=t.steps * t.views_per_step / max(1, len(cameras)),
-        lmbda=t.lmbda if size is None else lambda_for(size / anchors),
+        lmbda=t.lmbda,
         pixels=max((camera.width * camera.height for camera in cameras), default=0),
         device=device.type,
         processes=world(),
         poses_in_doubt=bool(scene.poses_in_doubt),
         points_at_hand=points_at_hand,
     )
+    if t.target_bytes is None:
+        return start
+    return replace(start, lmbda=lambda_for(t.target_bytes / anchors, dense=start.dense))
 
 
 def plan_for(
