@@ -14,6 +14,9 @@ INSTALLED := $(VENV)/.installed
 
 # Idle OpenMP threads sleep instead of taking the cores from numba's.
 export OMP_WAIT_POLICY ?= PASSIVE
+# Bytecode is kept, whatever the shell says: tests start the program many times, and compiling its modules takes each
+# time half a second.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help demo test test-all lint bounds docs web venv
 
