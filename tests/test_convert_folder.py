@@ -117,7 +117,8 @@ def test_splats_become_cgs_files(folder: Path, tmp_path: Path) -> None:
     assert open_scene(tmp_path / "out" / "a.ply.cgs").counts
 
 
-@pytest.mark.parametrize("listed", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("listed", [True, False])
 def test_the_step_of_the_action_leaves_its_table_where_the_comment_is_made_of_it(
     listed: bool, folder: Path, tmp_path: Path
 ) -> None:

@@ -95,6 +95,7 @@ def test_a_file_that_cannot_say_that_splats_are_antialiased_is_told_of(
     assert f"{tmp_path / 'b.glb'}: its splats are antialiased" in caplog.text
 
 
+@pytest.mark.slow
 def test_harmonics_above_the_degree_are_left_out_and_the_rest_is_fitted(ply: Path, tmp_path: Path) -> None:
     plain = export(ply, tmp_path / "b.ply", degree=0, refine=0)
     fitted = export(ply, tmp_path / "c.ply", degree=0, refine=60)

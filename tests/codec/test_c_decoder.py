@@ -81,6 +81,7 @@ def test_it_compiles_without_a_warning(compiler: str, options: tuple[str, ...], 
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_forgeries_are_refused_or_read_as_by_the_package(program: Path, tmp_path: Path) -> None:
     files = [path.read_bytes() for path in golden_paths()]
     file, folder = tmp_path / "forged.cgs", tmp_path / "arrays"

@@ -211,6 +211,7 @@ def slow_latents(content: FileContent) -> list[np.ndarray]:
     ]
 
 
+@pytest.mark.slow
 @given(
     st.integers(1, 60),
     st.integers(0, 1 << 20),

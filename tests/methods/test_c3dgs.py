@@ -253,6 +253,7 @@ def test_positions_count_from_the_middle_and_rates_are_those_of_the_run(
         assert rates[f"hooks/{entry}"] == rates[own]
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_continues_exactly(
     check_continues: Callable[..., None], plain: SplatModel
 ) -> None:

@@ -136,6 +136,7 @@ def test_a_heavier_penalty_leaves_fewer_splats(blob_scene: Scene) -> None:
     assert left[0] > left[1] > 1.5 * left[2] > 0, left
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_continues_exactly(check_continues: Callable[..., None]) -> None:
     config = replace(settings(opacity_weight=10.0), training=TrainingConfig(steps=80, seed=3))
     check_continues("compact3d", config, (30, 50, 70))

@@ -104,6 +104,7 @@ def test_the_file_shows_what_the_training_drew(blob_scene: Scene) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_continues_exactly(check_continues: Any) -> None:
     check_continues("compact-3dgs", small(codes=8, codes_start=0.4), (10, 30))
 

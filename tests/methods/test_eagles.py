@@ -84,6 +84,7 @@ def test_the_file_holds_what_was_drawn(blob_scene: Scene) -> None:
     assert drawn.rest.abs().max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_continues_exactly(check_continues: Any) -> None:
     check_continues("eagles", quick("eagles"), (10, 20))
 

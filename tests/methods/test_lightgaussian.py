@@ -176,6 +176,7 @@ def test_learning_rates_fall(blob_scene: Scene, plain: SplatModel) -> None:
     assert rates["dc"] == pytest.approx(2.5e-3 * section.settled_slowing**0.9, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_continues_exactly(
     check_continues: Callable[..., None], plain: SplatModel
 ) -> None:

@@ -78,6 +78,7 @@ def test_photographs_that_cannot_be_joined_leave_nothing_behind(tmp_path: Path) 
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("others", [0, 3])
 def test_few_photographs_that_are_joined_are_warned_of(
     walls: Walls, tmp_path: Path, capsys: pytest.CaptureFixture[str], others: int
@@ -97,6 +98,7 @@ def test_few_photographs_that_are_joined_are_warned_of(
     assert ("--features 8192 may join more" in told) == (others == 3)
 
 
+@pytest.mark.slow
 def test_pinhole_images_come_out_where_they_are_asked_for(walls: Walls, tmp_path: Path) -> None:
     result = reconstruct(walls.folder, tmp_path / "scene", ReconstructOptions(undistort=True, features=800))
     told = json.loads((result.scene / "reconstruction.json").read_text())

@@ -75,6 +75,7 @@ def test_dense_points_lie_on_the_surfaces(scene: Scene, solids: ray_tracing.Soli
     assert np.mean(misses(solids, moved, cameras) < 0.03) < 0.6
 
 
+@pytest.mark.slow
 def test_masked_pixels_have_no_points(scene: Scene) -> None:
     nothing = np.zeros((84, 112), bool)
     masked = replace(scene, train_views=tuple(replace(view, counted=nothing) for view in scene.train_views))
@@ -124,6 +125,7 @@ def test_a_run_begins_with_the_dense_points(scene: Scene, found: Points) -> None
     assert 2 * few < many <= few + len(found)
 
 
+@pytest.mark.slow
 def test_the_same_photographs_give_the_same_points_and_no_more_than_there_is_room_for(
     scene: Scene, found: Points
 ) -> None:

@@ -226,6 +226,7 @@ def test_a_tile_that_fails_is_said_and_the_others_are_trained(
     assert (folder / "blocks" / "1_0" / "1_0.cgs").is_file() and not (folder / "city.tiles").exists()
 
 
+@pytest.mark.slow
 def test_commands_open_the_run_the_folder_and_the_manifest(
     city: Path, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], runs: InThisProcess
 ) -> None:

@@ -5,9 +5,10 @@ with the photographs and with the model it was written from.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -240,7 +241,13 @@ def learned() -> Callable[[str, Config], tuple[Scene, TrainedModel]]:
     return learn
 
 
-@pytest.mark.parametrize("name", SCENES)
+def some_often(names: Iterable[str]) -> list[Any]:
+    """Cases of which those that rarely break alone are slow: each learns a scene."""
+    often = ("portrait", "without_points", "one_point", "in_millimeters")
+    return [name if name in often else pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize("name", some_often(SCENES))
 def test_an_odd_scene_is_learned_and_its_file_shows_it(
     name: str, config: Config, learned: Callable[[str, Config], tuple[Scene, TrainedModel]], tmp_path: Path
 ) -> None:
@@ -257,7 +264,9 @@ def test_an_odd_scene_is_learned_and_its_file_shows_it(
         assert np.quantile(difference, 0.9) < 1e-3
 
 
-@pytest.mark.parametrize("name", ["portrait", "forward_facing", "differing_sizes", "one_object_on_white"])
+@pytest.mark.parametrize(
+    "name", some_often(["portrait", "forward_facing", "differing_sizes", "one_object_on_white"])
+)
 def test_views_that_were_held_out_are_recognizable(
     name: str, config: Config, learned: Callable[[str, Config], tuple[Scene, TrainedModel]]
 ) -> None:

@@ -164,9 +164,8 @@ def trained(kind: type, scene: Scene, config) -> tuple:
     return trainer, SplatModel(trainer.parameters.trained().arrays(), scene.background)
 
 
-@pytest.mark.parametrize(
-    ("kind", "steps"), [(Trainer, 200), pytest.param(SplatTrainer, 240, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("kind", "steps"), [(Trainer, 200), (SplatTrainer, 240)])
+@pytest.mark.slow
 def test_known_gains_are_recovered_beside_a_scene_and_photographs_are_met_better(
     blob_scene, tiny_config, kind, steps
 ) -> None:

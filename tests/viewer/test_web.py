@@ -24,6 +24,7 @@ def test_style_and_types_hold(node: str) -> None:
     run([node, "node_modules/prettier/bin/prettier.cjs", "--check", "."])
 
 
+@pytest.mark.slow
 def test_a_browser_decodes_the_same_integers_and_gaussians(node: str, built: Path, tmp_path: Path) -> None:
     path = os.pathsep.join(filter(None, (str(PAGE.parents[2]), os.environ.get("PYTHONPATH"))))
     run([sys.executable, "test/make_fixtures.py", str(tmp_path)], PYTHONPATH=path)

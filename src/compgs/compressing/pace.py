@@ -81,8 +81,8 @@ def seconds_per_step(
 
 
 def mean_pace(told: Sequence[tuple[int, float]], coarse_until: float, steps: int) -> float | None:
-    """Seconds of a step of a run, by when some of a short run's `steps` were done: (step, seconds on a clock), ascending.
-    Both look at coarse photographs until the same share of them. None if fewer than two were told.
+    """Seconds of a step of a run, by when some of a trial's `steps` were done: (step, seconds on a clock), ascending.
+    Both look at coarse photographs until the same share of their steps. None if fewer than two were told.
     """
     coarse, whole = [], []
     for (before, since), (step, now) in pairwise(told):
