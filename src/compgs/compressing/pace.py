@@ -24,7 +24,7 @@ TRIED_VIEWS = 8
 # counted in (measured: docs/results/compress.md).
 WHOLE_RUN = 1.0
 # A step of a run that looks for points, in those of a trial that does not: more anchors at first, then pruning. By
-# processor time it was 1.1 on Bonsai and 1.4 to 1.5 on Truck (docs/results/truck.md#what-a-plan-says-beforehand).
+# processor time it was 1.1 on Bonsai, and about 1.4 on Truck (docs/results/truck.md#what-a-plan-says-beforehand).
 WITH_POINTS = 1.3
 
 
