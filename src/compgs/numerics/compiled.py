@@ -11,8 +11,8 @@ from Python leave out:
 
     double(x, y)
 
-To hand over a part takes 20 microseconds, in virtual machines 100 and more: with `max_threads`, a function of the same arguments, a kernel says among how
-many threads a call is worth to be divided at most.
+To hand over a part takes 20 microseconds, in virtual machines 100 and more: with `max_threads`, a function of the same
+arguments, a kernel says among how many threads a call is worth to be divided at most.
 
 Parts are contiguous. What stands before the loop is done by every thread. Arrays of one call must not overlap; of other
 kernels `no_alias=True` promises that.
