@@ -162,10 +162,10 @@ def test_steps_are_as_many_as_fit_into_the_time(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr(pace, "seconds_per_step", lambda *_: 0.05)
     monkeypatch.setattr(pace, "plan_for", lambda *_, **__: None)
     fitting = pace.steps_within(None, config, 100.0, None)
-    assert abs(fitting.steps - 2000 / pace.WHOLE_RUN) < 20 and fitting.late == 0
+    assert abs(fitting.steps - 2000) < 20 and fitting.late == 0
     short = pace.steps_within(None, config, 2.0, None)
     assert short.steps == pace.FEWEST
-    assert short.late == pytest.approx(0.05 * pace.WHOLE_RUN * pace.FEWEST - 2.0, abs=0.2)
+    assert short.late == pytest.approx(0.05 * pace.FEWEST - 2.0, abs=0.2)
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,14 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         assert 1 / 5 < lambda_for(size / 6423) / lmbda < 5
         expected = expected_bytes(replace(USUAL, anchors=6423, lmbda=lmbda))
         assert expected is not None and 1 / 3 < expected / size < 3
-    for record in ("truck", "truck_adjusted", "truck_adjusted_1e-3", "truck_adjusted_whole", "bonsai"):
+    for record in (
+        "truck",
+        "truck_adjusted",
+        "truck_adjusted_1e-3",
+        "truck_adjusted_whole",
+        "bonsai",
+        "bonsai_default",
+    ):
         run = json.loads((ROOT / f"docs/results/records/{record}.json").read_text(encoding="utf-8"))
         expected = expected_bytes(Start(**run["plan"]["start"]))
         assert expected is not None and 1 / 1.7 < expected / run["results"]["bytes"] < 1.7

@@ -20,9 +20,6 @@ TRIED_PART = 0.1  # of the time
 # Fewer than the first steps, which do not count: a view is slow when it is looked at for the first time, as nothing is
 # known of what hides there.
 TRIED_VIEWS = 8
-# A step of the whole run, in steps of its beginning: anchors grow, then most of them are pruned, and the rate is always
-# counted in (measured: docs/results/compress.md).
-WHOLE_RUN = 1.0
 # A step of a run that looks for points, in those of a trial that does not: more anchors at first, then pruning. By
 # processor time it was 1.1 on Bonsai, and about 1.4 on Truck (docs/results/truck.md#what-a-plan-says-beforehand).
 WITH_POINTS = 1.3
@@ -42,7 +39,7 @@ def steps_within(
     """Steps of a training that ends about `seconds` from now. `points_at_hand`: none are looked for before it."""
     start = time.perf_counter()
     plan = plan_for(scene, config, chosen_device(device), points_at_hand=points_at_hand)
-    pace = WHOLE_RUN * seconds_per_step(scene, config, device, plan, seconds)
+    pace = seconds_per_step(scene, config, device, plan, seconds)
     left = seconds - (time.perf_counter() - start)
     steps = max(FEWEST, int(left / pace))
     return Fitting(steps, max(0.0, steps * pace - left))
@@ -66,18 +63,17 @@ def seconds_per_step(
     anchors = WITH_POINTS if plan.dense_points > 0 else 1.0
     plan = replace(plan, dense_points=0.0)
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
-    told: list[tuple[int, float]] = []  # steps, and when they were done
-    first: list[float] = []
+    told: list[tuple[TrainingStatus, float]] = []  # and when
 
     def tell(status: TrainingStatus) -> None:
-        told.append((status.step, time.monotonic()))
-        first.append(status.seconds_per_step)
+        told.append((status, time.monotonic()))
         if status.step >= LEAST_TRIED and time.monotonic() > end:
             raise _Enough
 
     with contextlib.suppress(_Enough):
         train(replace(scene, train_views=views), trial(config), device=device, progress=tell, plan=plan)
-    return anchors * (mean_pace(told, plan.coarse_until, TRIED) or first[0])
+    pace = mean_pace([(status.step, now) for status, now in told], plan.coarse_until, TRIED)
+    return anchors * (told[0][0].seconds_per_step if pace is None else pace)
 
 
 def mean_pace(told: Sequence[tuple[int, float]], coarse_until: float, steps: int) -> float | None:
