@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, features
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -28,7 +28,7 @@ def tool(name: str):
 @pytest.mark.slow
 def test_its_stages_pass_where_the_cpu_is_on_both_sides(tmp_path):
     command = [sys.executable, str(ROOT / "tools" / "device_check.py"), "-o", str(tmp_path / "check")]
-    stages = "versions,kernels,parity,trace"
+    stages = "versions,kernels,parity,gpu_tests,trace"
     done = subprocess.run(
         [*command, "--device", "cpu", "--quick", "--stages", stages],
         capture_output=True,
@@ -72,6 +72,7 @@ def test_a_stripped_gsplat_has_three_channels_and_the_operators_that_are_used(tm
     compile((target / "cuda" / "_backend.py").read_text(), "_backend.py", "exec")
 
 
+@pytest.mark.skipif(not features.check("avif"), reason="this Pillow writes no AVIF")
 def test_a_packed_capture_takes_no_more_than_it_may(tmp_path):
     bundle = tool("device_bundle")
     scene = tmp_path / "scene"
@@ -89,3 +90,23 @@ def test_a_packed_capture_takes_no_more_than_it_may(tmp_path):
     assert (tmp_path / "packed" / "sparse" / "0" / "cameras.bin").read_bytes() == b"cameras"
     with pytest.raises(SystemExit, match="do not fit"):
         bundle.pack_scene(scene, tmp_path / "none", 1000)
+
+
+def test_runs_side_by_side_keep_their_files_and_end_in_time(tmp_path, monkeypatch, capsys):
+    runs, folder = tool("device_runs"), tmp_path / "out"
+    (folder / "runs").mkdir(parents=True)
+    does = {
+        "done": "import pathlib; p = pathlib.Path(r'{}'); p.mkdir(); (p / 'done.cgs').write_text('made')",
+        "fails": "raise SystemExit(3)",
+        "slow": "import time; time.sleep(600)",
+    }
+
+    def start(name, arguments, folder):
+        return subprocess.Popen([sys.executable, "-c", does[name].format(folder / "runs" / name)])
+
+    monkeypatch.setattr(runs, "start", start)
+    lines = {line["name"]: line for line in runs.run_all(dict.fromkeys(does, ""), folder, 8)}
+    assert (folder / "done.cgs").read_text() == "made" and lines["done"]["code"] == 0
+    assert lines["fails"]["code"] == 3 and not lines["fails"]["file"]
+    assert lines["slow"]["code"] == -15 and not lines["slow"]["in time"]
+    assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == list(lines)

@@ -51,6 +51,7 @@ FIRST = (
     "truck_adjusted_1e-3",
     "truck_adjusted_default",
     "bonsai_default",
+    "bonsai_1e-3",
     "bonsai",
 )
 # Of a run, said by its command; all else is the preset's.
