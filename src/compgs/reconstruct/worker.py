@@ -39,8 +39,8 @@ def find_poses(job: dict[str, Any]) -> None:
 
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = threads
-    _tell("matching")
     if job["matching"] == "sequential":
+        _tell("matching")
         pairing = pycolmap.SequentialPairingOptions()
         pairing.overlap = job["overlap"]
         pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing)
@@ -49,8 +49,10 @@ def find_poses(job: dict[str, Any]) -> None:
         listed.match_list_path = database.with_name("pairs.txt")
         with numbered(database):
             listed.match_list_path.write_text(alike_pairs(database, job["seed"]), encoding="utf-8")
+            _tell("matching")  # not before: how many pairs there are is known now
             pycolmap.match_image_pairs(database, matching_options=matching, pairing_options=listed)
     else:
+        _tell("matching")
         pycolmap.match_exhaustive(database, matching_options=matching)
 
     mapping = pycolmap.IncrementalPipelineOptions()

@@ -10,7 +10,10 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", 
 # Files about a capture, not of it, by the beginning of their names.
 ABOUT = ("license", "licence", "readme", "copying", "notice", "citation")
 # What `compgs reconstruct`, `compgs adjust` and file managers leave.
-BYPRODUCTS = ("reconstruction.json", "reconstruction.png", "adjustment.json", "thumbs.db", "desktop.ini")
+LEFT = ("reconstruction.json", "reconstruction.png", "adjustment.json", "thumbs.db", "desktop.ini")
+# Which cameras of COLMAP 4 are mounted on which rig; the poses of images hold all that a reader needs of it.
+RIGS = ("rigs.bin", "frames.bin", "rigs.txt", "frames.txt")
+BYPRODUCTS = (*LEFT, *RIGS)
 MOST_NAMED = 12
 FEW = 3  # files of one folder that are named one by one
 
