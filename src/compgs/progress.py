@@ -1,5 +1,5 @@
 """How far a long computation is, for whoever calls it from Python: one line on a terminal or in a notebook, which
-changes; elsewhere lines of the logger `compgs`, at the level INFO.
+changes; elsewhere lines of the logger `compgs`, at the level INFO, of what takes longer than LOG_SECONDS.
 
 Functions that take long have an argument `progress`: None for this, False for nothing, or a function of one's own. A
 training calls it with a `TrainingStatus`, everything else with two numbers: how much is done, and of how much.
@@ -51,6 +51,8 @@ class Status(Protocol):
 
 class Line(Protocol):
     """Where a text stands that changes."""
+
+    overwritten: bool  # by the next text; lines that stay are few
 
     def show(self, text: str) -> None: ...
 
@@ -122,12 +124,14 @@ def time_left(status: Status) -> str:
 def _line() -> Iterator[Callable[[str, bool], None]]:
     """Yields `show(text, whether it is the last)`."""
     line, pause = _place()
-    last = -pause
+    begun = last = time.monotonic()
+    if line.overwritten:
+        last -= pause
 
     def show(text: str, final: bool) -> None:
         nonlocal last
         now = time.monotonic()
-        if final or now - last >= pause:
+        if now - last >= pause or (final and (line.overwritten or last > begun)):
             line.show(text)
             last = now
 
@@ -155,6 +159,7 @@ def _in_notebook() -> bool:
 class TerminalLine:
     """One line of a terminal."""
 
+    overwritten = True
     used = False
 
     def show(self, text: str) -> None:
@@ -171,6 +176,7 @@ class TerminalLine:
 class NotebookLine:
     """One line below a notebook's cell."""
 
+    overwritten = True
     handle: Any = None
 
     def show(self, text: str) -> None:
@@ -188,6 +194,8 @@ class NotebookLine:
 
 class LogLines:
     """Lines of the log."""
+
+    overwritten = False
 
     def show(self, text: str) -> None:
         LOGGER.info("%s", text)

@@ -1,4 +1,6 @@
-"""Notes of the program (`compgs.notes`), shown to a person while a command runs."""
+"""What the program logs, shown to a person while a command runs: notes (`compgs.notes`), and how far something long is
+(`compgs.progress`) where no terminal shows it.
+"""
 
 import logging
 from collections.abc import Iterator
@@ -9,7 +11,7 @@ from compgs.notes import LOGGER
 
 
 class Shown(logging.Handler):
-    """Says each line once: a command may open a file more than once."""
+    """Says each note once: a command may open a file more than once."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -17,17 +19,21 @@ class Shown(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage()
-        if text not in self.said:
+        if record.levelno < logging.WARNING:
+            say(text)
+        elif text not in self.said:
             self.said.add(text)
             say(f"note: {text}")
 
 
 @contextmanager
 def notes_shown() -> Iterator[None]:
-    """Notes are shown while this lasts."""
-    handler = Shown()
+    """Notes, and progress, are shown while this lasts."""
+    handler, level = Shown(), LOGGER.level
     LOGGER.addHandler(handler)
+    LOGGER.setLevel(logging.INFO)
     try:
         yield
     finally:
+        LOGGER.setLevel(level)
         LOGGER.removeHandler(handler)
