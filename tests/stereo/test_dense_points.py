@@ -14,6 +14,7 @@ from compgs.scene import ray_tracing
 from compgs.scene.generated import camera_path, observe, still_life
 from compgs.scene.views import Points, Scene, View
 from compgs.stereo import dense_points
+from compgs.stereo.dense_points import expected_points
 from compgs.stereo.fusion import Places, thinned
 from compgs.stereo.neighbours import neighbours_of, sight_of
 from compgs.training.plan import plan
@@ -85,6 +86,12 @@ def test_masked_pixels_have_no_points(scene: Scene) -> None:
 def test_views_that_see_no_points_say_nothing(scene: Scene) -> None:
     far = Points(scene.points.positions + 1e6, scene.points.colors)
     assert len(dense_points(replace(scene, points=far), 4.0, CPU)) == 0
+
+
+@pytest.mark.parametrize("spacing", [2.0, 4.0, 8.0])
+def test_how_many_points_there_will_be_is_known_within_a_factor_of_two(scene: Scene, spacing: float) -> None:
+    found = len(dense_points(scene, spacing, CPU))
+    assert 0.5 * found < expected_points(scene, spacing) < 2.0 * found
 
 
 def test_neighbours_stand_a_little_aside() -> None:

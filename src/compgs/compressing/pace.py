@@ -11,6 +11,7 @@ from compgs.compressing.deadline import FEWEST
 from compgs.config import Config
 from compgs.methods import train
 from compgs.scene.views import Scene
+from compgs.stereo.dense_points import expected_points
 from compgs.training import Plan, TrainingStatus, plan_for
 from compgs.training.run.run import chosen_device
 
@@ -20,9 +21,9 @@ TRIED_PART = 0.1  # of the time
 # Fewer than the first steps, which do not count: a view is slow when it is looked at for the first time, as nothing is
 # known of what hides there.
 TRIED_VIEWS = 8
-# A step of a run that looks for points, in those of a trial that does not: more anchors at first, then pruning. By
-# processor time it was 1.1 on Bonsai, and about 1.4 on Truck (docs/results/truck.md#what-a-plan-says-beforehand).
-WITH_POINTS = 1.3
+# What a run's steps take longer for each time as many points as the trial's anchors that are found before it: most are
+# pruned again in the first half of the run (docs/results/truck.md#what-a-plan-says-beforehand).
+FOR_POINTS = 0.18
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,11 @@ def seconds_per_step(
     coarse photographs. The first ones, in which kernels are loaded and views are new, do not count.
 
     The plan is the whole scene's: the few views that are tried would make another one. No points are looked for, which
-    takes minutes; a step of the run takes longer by the anchors that come with them. Of `seconds` the trial takes no
-    more than a part.
+    takes minutes; a step of the run takes longer by the anchors that would come with them. Of `seconds` the trial takes
+    no more than a part.
     """
     end = time.monotonic() + TRIED_PART * seconds
-    anchors = WITH_POINTS if plan.dense_points > 0 else 1.0
+    longer = 1.0 + FOR_POINTS * points_found(scene, plan)
     plan = replace(plan, dense_points=0.0)
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
     told: list[tuple[TrainingStatus, float]] = []  # and when
@@ -73,7 +74,14 @@ def seconds_per_step(
     with contextlib.suppress(_Enough):
         train(replace(scene, train_views=views), trial(config), device=device, progress=tell, plan=plan)
     pace = mean_pace([(status.step, now) for status, now in told], plan.coarse_until, TRIED)
-    return anchors * (told[0][0].seconds_per_step if pace is None else pace)
+    return longer * (told[0][0].seconds_per_step if pace is None else pace)
+
+
+def points_found(scene: Scene, plan: Plan) -> float:
+    """How many points are looked for before a run, for each anchor that it has without them."""
+    if plan.dense_points <= 0:
+        return 0.0
+    return expected_points(scene, plan.dense_points) / plan.start.anchors
 
 
 def mean_pace(told: Sequence[tuple[int, float]], coarse_until: float, steps: int) -> float | None:

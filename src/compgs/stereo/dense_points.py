@@ -13,12 +13,16 @@ from compgs.numerics.freed_memory import give_back_freed
 from compgs.progress import Counting
 from compgs.scene.views import Points, Scene
 from compgs.stereo.fusion import Depths, agreed, thinned
-from compgs.stereo.looks import looks_of, small_camera
+from compgs.stereo.looks import COMPARED_PIXELS, looks_of, small_camera
 from compgs.stereo.neighbours import asked_of, neighbours_of, sight_of
 from compgs.stereo.plane_sweep import swept
 
 SWEPT = 110  # photographs whose distances are found, evenly spread: the others are looked at as neighbours
 FEWEST_NEIGHBOURS = 2  # the sweep takes the mean of the best two
+# Points that SWEPT photographs of COMPARED_PIXELS give at a spacing of one of these pixels. At s pixels it is one in s,
+# not one in s^2, as fewer pixels agree than there are cells: Truck at full size has 391 000 / s, Bonsai 426 000 / s,
+# Truck's photographs at 1600 pixels 367 000 / s.
+GIVEN = 390_000
 
 
 @torch.no_grad()
@@ -40,6 +44,15 @@ def dense_points(
     points = thinned(agreed(depths), spacing * small_camera(full).width / full.width, known)
     give_back_freed()  # before training, which keeps what is free
     return points
+
+
+def expected_points(scene: Scene, spacing: float) -> float:
+    """How many points `dense_points` finds, about, without looking."""
+    full = scene.train_views[0].camera
+    small = small_camera(full)
+    apart = max(spacing * small.width / full.width, 1.0)
+    looked_at = min(len(scene.train_views), SWEPT) / SWEPT * small.width * small.height / COMPARED_PIXELS
+    return GIVEN / apart * looked_at
 
 
 def _depths(scene: Scene, device: torch.device, progress: Counting | None) -> list[Depths]:
