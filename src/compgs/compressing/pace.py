@@ -11,9 +11,9 @@ from compgs.compressing.deadline import FEWEST
 from compgs.config import Config
 from compgs.methods import train
 from compgs.scene.views import Scene
-from compgs.stereo.dense_points import expected_points
 from compgs.training import Plan, TrainingStatus, plan_for
 from compgs.training.run.run import chosen_device
+from compgs.training.start import points_foretold
 
 TRIED = 60  # steps; fewer where these alone would take much of the time
 LEAST_TRIED = 10  # steps
@@ -61,7 +61,7 @@ def seconds_per_step(
     no more than a part.
     """
     end = time.monotonic() + TRIED_PART * seconds
-    longer = 1.0 + FOR_POINTS * points_found(scene, plan)
+    longer = 1.0 + FOR_POINTS * points_foretold(scene, plan)
     plan = replace(plan, dense_points=0.0)
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
     told: list[tuple[TrainingStatus, float]] = []  # and when
@@ -75,13 +75,6 @@ def seconds_per_step(
         train(replace(scene, train_views=views), trial(config), device=device, progress=tell, plan=plan)
     pace = mean_pace([(status.step, now) for status, now in told], plan.coarse_until, TRIED)
     return longer * (told[0][0].seconds_per_step if pace is None else pace)
-
-
-def points_found(scene: Scene, plan: Plan) -> float:
-    """How many points are looked for before a run, for each anchor that it has without them."""
-    if plan.dense_points <= 0:
-        return 0.0
-    return expected_points(scene, plan.dense_points) / plan.start.anchors
 
 
 def mean_pace(told: Sequence[tuple[int, float]], coarse_until: float, steps: int) -> float | None:

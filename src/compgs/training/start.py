@@ -18,6 +18,7 @@ from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Points, Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.stereo import dense_points
+from compgs.stereo.dense_points import expected_points
 from compgs.trained_model import TrainedModel
 from compgs.training.plan import Plan, Start, grid_spacings, head_bits, lambda_for, plan
 from compgs.training.run.distributed import world
@@ -118,6 +119,13 @@ def initial_model(
         model.up = up_direction(cameras)
         model.angular_dilation = angular_dilation(chosen.dilation, cameras)
     return model
+
+
+def points_foretold(scene: Scene, chosen: Plan) -> float:
+    """About how many points a run looks for before its first step, for each anchor that it has without them."""
+    if chosen.dense_points <= 0:
+        return 0.0
+    return expected_points(scene, chosen.dense_points) / chosen.start.anchors
 
 
 def with_dense_points(scene: Scene, pixels: float, most: int, device: torch.device) -> Scene:
