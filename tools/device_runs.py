@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Collection
 from pathlib import Path
 
 SAVING = 30  # seconds for a checkpoint, after which a run is killed
@@ -28,14 +29,17 @@ def start(name: str, arguments: str, folder: Path) -> subprocess.Popen[bytes]:
         return subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
 
 
-def stop(running: subprocess.Popen[bytes]) -> None:
-    """Stop a run so that it saves; kill it if that takes too long."""
-    running.send_signal(signal.SIGTERM)
-    try:
-        running.wait(SAVING)
-    except subprocess.TimeoutExpired:
-        running.kill()
-        running.wait()
+def stop(running: Collection[subprocess.Popen[bytes]]) -> None:
+    """Stop runs so that all of them save at once; kill what takes too long."""
+    end = time.monotonic() + SAVING
+    for each in running:
+        each.send_signal(signal.SIGTERM)
+    for each in running:
+        try:
+            each.wait(max(0.0, end - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            each.kill()
+            each.wait()
 
 
 def run_all(parts: dict[str, str], folder: Path, seconds: float) -> list[dict[str, object]]:
@@ -45,9 +49,9 @@ def run_all(parts: dict[str, str], folder: Path, seconds: float) -> list[dict[st
     lines: list[dict[str, object]] = []
     while left:
         late = time.monotonic() - begun > seconds
+        if late:
+            stop(left.values())
         for name, running in list(left.items()):
-            if late:
-                stop(running)
             if running.poll() is None:
                 continue
             made = folder / "runs" / name / f"{name}.cgs"

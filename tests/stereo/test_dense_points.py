@@ -13,8 +13,7 @@ from compgs.numerics.evenly import evenly
 from compgs.scene import ray_tracing
 from compgs.scene.generated import camera_path, observe, still_life
 from compgs.scene.views import Points, Scene, View
-from compgs.stereo import dense_points
-from compgs.stereo.dense_points import expected_points
+from compgs.stereo import dense_points, expected_points
 from compgs.stereo.fusion import Places, thinned
 from compgs.stereo.neighbours import neighbours_of, sight_of
 from compgs.training.plan import plan

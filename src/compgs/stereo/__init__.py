@@ -9,6 +9,6 @@
 | `dense_points` | all of it, from a scene to the points that are added |
 """
 
-from compgs.stereo.dense_points import dense_points
+from compgs.stereo.dense_points import dense_points, expected_points
 
-__all__ = ["dense_points"]
+__all__ = ["dense_points", "expected_points"]

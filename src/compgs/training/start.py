@@ -17,8 +17,7 @@ from compgs.scene.points import colors_at, median_spacing, neighbour_distance, v
 from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Points, Scene
 from compgs.scene.world import local_scene, world_offset
-from compgs.stereo import dense_points
-from compgs.stereo.dense_points import expected_points
+from compgs.stereo import dense_points, expected_points
 from compgs.trained_model import TrainedModel
 from compgs.training.plan import Plan, Start, grid_spacings, head_bits, lambda_for, plan
 from compgs.training.run.distributed import world
