@@ -87,8 +87,13 @@ def test_views_that_see_no_points_say_nothing(scene: Scene) -> None:
     assert len(dense_points(replace(scene, points=far), 4.0, CPU)) == 0
 
 
-@pytest.mark.parametrize("spacing", [2.0, 4.0, 8.0])
-def test_how_many_points_there_will_be_is_known_within_a_factor_of_two(scene: Scene, spacing: float) -> None:
+def test_how_many_points_there_will_be_is_known_within_a_factor_of_two(scene: Scene, found: Points) -> None:
+    assert 0.5 * len(found) < expected_points(scene, 4.0) < 2.0 * len(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spacing", [2.0, 8.0])
+def test_how_many_points_there_will_be_is_known_at_other_spacings(scene: Scene, spacing: float) -> None:
     found = len(dense_points(scene, spacing, CPU))
     assert 0.5 * found < expected_points(scene, spacing) < 2.0 * found
 

@@ -10,6 +10,7 @@ from compgs.losses import Target
 from compgs.metrics import psnr, to_8bit
 from compgs.render import render
 from compgs.scene.views import Scene
+from compgs.tensors import where
 from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.step.robust import GRID, Robust, cells, pixels
 from compgs.training.trainer import Trainer
@@ -55,6 +56,33 @@ def test_a_difference_that_is_everywhere_leaves_nothing_out() -> None:
     image = torch.from_numpy(chance.uniform(0.2, 0.8, (96, 96, 3))).float()
     other = torch.from_numpy(chance.integers(0, 255, (96, 96, 3), dtype=np.uint8))
     assert looks(Robust(3, CPU), image, other, 6).counted is None
+
+
+@pytest.mark.parametrize("counts", ["all", "the left half", "what differs"])
+def test_the_same_is_left_out_where_the_device_is_not_asked(
+    monkeypatch: pytest.MonkeyPatch, counts: str
+) -> None:
+    chance = np.random.default_rng(0)
+    image = torch.from_numpy(chance.uniform(0.2, 0.8, (96, 96, 3))).float()
+    photograph = (image * 255).round().to(torch.uint8)
+    photograph[30:60, 40:70] = torch.tensor([255, 0, 255], dtype=torch.uint8)
+    mask = torch.zeros(96, 96, dtype=torch.bool)
+    mask[:, :48], mask[34:56, 44:66] = counts == "the left half", counts == "what differs"
+    target = Target(photograph, None if counts == "all" else mask)
+
+    def counted(pays: bool) -> list[torch.Tensor]:
+        monkeypatch.setattr(where, "choosing_pays", lambda device: pays)
+        robust, found = Robust(3, CPU), []
+        for _ in range(6):
+            chosen = robust.trusted(0, image, target).counted
+            found.append(torch.ones(96, 96, dtype=torch.bool) if chosen is None else chosen)
+            robust.learn(0.5, [0], robust.gradients([0]))
+        return found
+
+    asked, not_asked = counted(True), counted(False)
+    assert all(torch.equal(a, b) for a, b in zip(asked, not_asked, strict=True))
+    # Where nothing else counts, what differs stays.
+    assert asked[-1][34:56, 44:48].any() == (counts == "what differs")
 
 
 def test_masked_pixels_say_nothing_of_their_cell() -> None:

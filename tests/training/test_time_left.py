@@ -76,6 +76,20 @@ def test_large_photographs_are_told_what_smaller_ones_would_take() -> None:
     assert left.by_divisor() == {}
 
 
+def test_sizes_that_are_not_drawn_take_as_long_as_the_nearest_by_their_pixels() -> None:
+    class Many(Fake):
+        """Forty sizes, of which six are drawn: photographs that were cut, each by another number of pixels."""
+
+        def camera_at(self, step: int, divisor: int = 1) -> Camera:
+            return Fake(self.width + 40 * (step * 7 % 40), self.height).camera_at(step, divisor)
+
+    run = Many(1000, 1000, step=10)
+    left = TimeLeft(run, STEPS, draws=picture_seconds)
+    left.look(step_seconds(run.camera_at(10)))
+    assert len(left.drawn) <= 7
+    assert left.seconds() == pytest.approx(truth(run, 10), rel=0.05)
+
+
 def test_steps_of_one_size_are_not_drawn_beforehand() -> None:
     run = Fake(200, 200, step=10)
     left = TimeLeft(run, STEPS, draws=picture_seconds)
