@@ -15,6 +15,7 @@ import torch
 from compgs.config import Phases
 from compgs.errors import CheckpointError
 from compgs.training.run.model_checkpoint import load_checkpoint
+from compgs.training.run.restoring import finite, restoring
 from compgs.training.splats.trainer import SplatTrainer
 from compgs.training.trainer import Trainer
 
@@ -229,3 +230,18 @@ def test_what_is_whole_goes_on(written, blob_scene) -> None:
         assert resumed(kind, blob_scene, path, config).step == 9
         with pytest.raises(CheckpointError, match="other settings"):
             resumed(kind, blob_scene, path, replace(config, training=replace(config.training, seed=4)))
+
+
+@pytest.mark.parametrize(
+    "values", [[1.0], [1.0, 2.0, 3.0], (1.0, 2.0), [1.0, float("nan")], [1.0, 0.5], [1.0, True], "12", None]
+)
+def test_numbers_are_as_many_as_expected_finite_and_above_the_least(values: object) -> None:
+    assert finite([1.0, 2], 2, "units", above=0.5) == (1.0, 2.0)
+    with pytest.raises(ValueError, match="units: expected 2 finite numbers"):
+        finite(values, 2, "units", above=0.5)
+
+
+def test_a_long_reason_is_cut(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError) as error, restoring(tmp_path / "checkpoint"):
+        raise ValueError("of a tensor " * 1000)
+    assert str(error.value).count("of a tensor ") == 16  # 200 characters
