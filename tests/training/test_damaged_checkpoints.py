@@ -243,5 +243,5 @@ def test_numbers_are_as_many_as_expected_finite_and_above_the_least(values: obje
 
 def test_a_long_reason_is_cut(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError) as error, restoring(tmp_path / "checkpoint"):
-        raise ValueError("of a tensor " * 1000)
-    assert str(error.value).count("of a tensor ") == 16  # 200 characters
+        raise ValueError("=" * 1000)
+    assert str(error.value).count("=") == 200
