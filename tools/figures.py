@@ -55,8 +55,8 @@ FIRST = (
     "bonsai_1e-3",
     "bonsai",
 )
-# Records beside which a later one of the same capture is better by each measure in fewer bytes or a tenth more, or has
-# the same command: only the pages of the captures have them.
+# Records of which only the pages of the captures speak: a later one of the same capture has the same command, or is no
+# worse by any measure, as tables print it, in at most a tenth more bytes.
 SUPERSEDED = ("truck_adjusted", "truck_adjusted_1e-3", "truck_adjusted_default", "bonsai")
 # Of a run, said by its command; all else is the preset's.
 ASKED = ("lmbda", "steps", "seed", "target_bytes")
