@@ -27,6 +27,8 @@ def _rows() -> int:
 
 
 ROWS = _rows()  # no result depends on it
+# Of a block of fewer columns, whose rows are one register at most.
+NARROW_ROWS = 8
 
 _INDEX, _BYTE, _FLOAT = ir.IntType(32), ir.IntType(8), ir.FloatType()
 
@@ -90,9 +92,11 @@ def _generator(rows: int, columns: int, adds: bool) -> Callable[..., Any]:
     return generate
 
 
-_by_16, _by_8, _by_4, _by_1 = (_block(ROWS, columns) for columns in (16, 8, 4, 1))
+_by_16 = _block(ROWS, 16)
+_by_8, _by_4, _by_1 = (_block(NARROW_ROWS, columns) for columns in (8, 4, 1))
 _row_by_16, _row_by_8, _row_by_4, _row_by_1 = (_block(1, columns) for columns in (16, 8, 4, 1))
-_add_by_16, _add_by_8, _add_by_4, _add_by_1 = (_block(ROWS, columns, adds=True) for columns in (16, 8, 4, 1))
+_add_by_16 = _block(ROWS, 16, adds=True)
+_add_by_8, _add_by_4, _add_by_1 = (_block(NARROW_ROWS, columns, adds=True) for columns in (8, 4, 1))
 _add_row_by_16, _add_row_by_8, _add_row_by_4, _add_row_by_1 = (
     _block(1, columns, adds=True) for columns in (16, 8, 4, 1)
 )
@@ -110,24 +114,24 @@ def multiply(a, b, out):  # [N, K], [K, C], [N, C] float32; the columns of b and
             _row_by_16(a, b, out, i, j)
         j += 16
     if j + 8 <= columns:
-        for i in range(0, len(a) - ROWS + 1, ROWS):
+        for i in range(0, len(a) - NARROW_ROWS + 1, NARROW_ROWS):
             _by_8(a, b, out, i, j)
-        for i in range(len(a) - len(a) % ROWS, len(a)):
+        for i in range(len(a) - len(a) % NARROW_ROWS, len(a)):
             _row_by_8(a, b, out, i, j)
         j += 8
     if j < columns and columns >= 4:
         # The last ones in fours, of which some are computed again, to the same bits.
         while j < columns:
             j = min(j, columns - 4)
-            for i in range(0, len(a) - ROWS + 1, ROWS):
+            for i in range(0, len(a) - NARROW_ROWS + 1, NARROW_ROWS):
                 _by_4(a, b, out, i, j)
-            for i in range(len(a) - len(a) % ROWS, len(a)):
+            for i in range(len(a) - len(a) % NARROW_ROWS, len(a)):
                 _row_by_4(a, b, out, i, j)
             j += 4
     while j < columns:
-        for i in range(0, len(a) - ROWS + 1, ROWS):
+        for i in range(0, len(a) - NARROW_ROWS + 1, NARROW_ROWS):
             _by_1(a, b, out, i, j)
-        for i in range(len(a) - len(a) % ROWS, len(a)):
+        for i in range(len(a) - len(a) % NARROW_ROWS, len(a)):
             _row_by_1(a, b, out, i, j)
         j += 1
 
@@ -144,20 +148,20 @@ def add_product(a, b, out):  # [N, K], [K, C], [N, C] float32; the columns of b 
             _add_row_by_16(a, b, out, i, j)
         j += 16
     if j + 8 <= columns:
-        for i in range(0, len(a) - ROWS + 1, ROWS):
+        for i in range(0, len(a) - NARROW_ROWS + 1, NARROW_ROWS):
             _add_by_8(a, b, out, i, j)
-        for i in range(len(a) - len(a) % ROWS, len(a)):
+        for i in range(len(a) - len(a) % NARROW_ROWS, len(a)):
             _add_row_by_8(a, b, out, i, j)
         j += 8
     if j + 4 <= columns:
-        for i in range(0, len(a) - ROWS + 1, ROWS):
+        for i in range(0, len(a) - NARROW_ROWS + 1, NARROW_ROWS):
             _add_by_4(a, b, out, i, j)
-        for i in range(len(a) - len(a) % ROWS, len(a)):
+        for i in range(len(a) - len(a) % NARROW_ROWS, len(a)):
             _add_row_by_4(a, b, out, i, j)
         j += 4
     while j < columns:
-        for i in range(0, len(a) - ROWS + 1, ROWS):
+        for i in range(0, len(a) - NARROW_ROWS + 1, NARROW_ROWS):
             _add_by_1(a, b, out, i, j)
-        for i in range(len(a) - len(a) % ROWS, len(a)):
+        for i in range(len(a) - len(a) % NARROW_ROWS, len(a)):
             _add_row_by_1(a, b, out, i, j)
         j += 1
