@@ -45,7 +45,7 @@ def prediction(dtype, *, revived=False, layout="paired", kept=1.0):
     return result.index, [f.detach() for f in fields], gradients
 
 
-@pytest.mark.parametrize("layout", ["paired", "separate"])
+@pytest.mark.parametrize("layout", ["paired", "shallow", "separate"])
 @pytest.mark.parametrize("revived", [False, True])
 def test_prediction_by_kernels_and_its_gradients_agree_with_float64_autograd(revived, layout):
     index, fields, gradients = prediction(torch.float32, revived=revived, layout=layout)

@@ -54,6 +54,19 @@ def tiled(biases):
     return tiles
 
 
+@njit
+def padded(weight):
+    """weight [H, O] with columns of zeros, up to 4, 8 or a multiple of 16: products of other widths take longer than of
+    the next of these (`numerics/products.py`).
+    """
+    H, O = weight.shape
+    wide = np.zeros((H, 4 if O <= 4 else 8 if O <= 8 else (O + 15) // 16 * 16), np.float32)
+    for i in range(H):
+        for j in range(O):
+            wide[i, j] = weight[i, j]
+    return wide
+
+
 @njit(fastmath=FASTMATH)
 def add_shared(first, shared, index, x):
     """first[i] += shared[index[i]]; x [n, H] = leaky(its first columns)."""
@@ -134,8 +147,10 @@ def forward(
     groups = (M + ROWS - 1) // ROWS
     tasks = min(groups, TASKS)
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
+    wide_weight = padded(output_weight)
     for t in chunk_of(tasks, part):
         own = np.empty((ROWS, G), np.float32)
+        wide = np.empty((ROWS, wide_weight.shape[1]), np.float32)
         first = np.empty((ROWS, H + O), np.float32)
         x = np.empty((blocks + 1, ROWS, H), np.float32)
         h = np.empty((ROWS, H), np.float32)
@@ -146,7 +161,7 @@ def forward(
             hidden_layers(
                 taken, index[p:q], shared, residual_entry, weights1, tiles1, weights2, tiles2, first[:n], x, h
             )
-            multiply(x[blocks, :n], output_weight, out[p:q])
+            multiply(x[blocks, :n], wide_weight, wide[:n])
             for i in range(n):
                 for j in range(O):
-                    out[p + i, j] += first[i, H + j]
+                    out[p + i, j] = wide[i, j] + first[i, H + j]

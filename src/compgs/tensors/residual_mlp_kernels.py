@@ -20,6 +20,7 @@ from compgs.model.network_kernels import (
     add_shared,
     add_two,
     chosen_rows,
+    padded,
     tiled,
 )
 from compgs.numerics.compiled import chunk_of, njit
@@ -125,6 +126,7 @@ def backward(
             for j in range(H):
                 weights1_t[b, j, i], weights2_t[b, j, i] = weights1[b, i, j], weights2[b, i, j]
     tiles1, tiles2 = tiled(biases1), tiled(biases2)
+    wide = padded(output_weight).shape[1]
     for c in chunk_of(len(bounds) - 1, part):
         own = np.empty((ROWS, G), np.float32)
         first = np.empty((ROWS, F), np.float32)
@@ -135,6 +137,8 @@ def backward(
         d_taken = np.empty((ROWS, G), np.float32)
         ones = np.ones((1, ROWS), np.float32)
         weights = d_weights[c]
+        wide_d, wide_weights = np.zeros((ROWS, wide), np.float32), np.zeros((H, wide), np.float32)
+        output = G * F + blocks * 2 * (H * H + H)  # where the output weight's begin
         for p in range(bounds[c], bounds[c + 1], ROWS):
             q = min(bounds[c + 1], p + ROWS)
             n = q - p
@@ -144,9 +148,12 @@ def backward(
             )
             d = d_out[p:q]
             multiply(d, output_t, dx[:n])
-            at = G * F + blocks * 2 * (H * H + H)
+            at = output
             if want_weights:
-                add_product(x[blocks, :n].T, d, weights[at : at + H * O].reshape(H, O))
+                for i in range(n):
+                    for j in range(O):
+                        wide_d[i, j] = d[i, j]
+                add_product(x[blocks, :n].T, wide_d[:n], wide_weights)
             for b in range(blocks - 1, -1, -1):
                 at -= 2 * (H * H + H)
                 multiply(dx[:n], weights2_t[b], dh[:n])
@@ -170,3 +177,7 @@ def backward(
                 for i in range(n):
                     for j in range(G):
                         d_residuals[rows[p + i], j] += d_taken[i, j]
+        if want_weights:
+            for i in range(H):
+                for j in range(O):
+                    weights[output + i * O + j] = wide_weights[i, j]
