@@ -100,7 +100,8 @@ class ModelConfig:
     # earlier symbols of an anchor, or of a coupled primitive, predict its later ones in the file (not in the paper;
     # training pays for each symbol by itself)
     row_context: bool = True
-    # separate: four networks (Sec. 3.2); paired: geometry, appearance; shallow: these without residual blocks
+    # separate: four networks (Sec. 3.2); paired: geometry, appearance; shallow: these without residual blocks, which
+    # large captures have
     heads: Heads = "paired"
     # world units between neighbouring anchors; none: `voxel_spacings` decides
     voxel_size: Annotated[float | None, Range(0, above=True)] = None

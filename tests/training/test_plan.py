@@ -51,7 +51,7 @@ def asked(**training: object) -> Config:
 def capacity(found: Plan) -> tuple[int, ...]:
     """What must not fall when bits become cheaper."""
     context = ("none", "neighbours").index(found.reference_context)
-    heads = ("paired", "separate").index(found.heads)
+    heads = ("shallow", "paired", "separate").index(found.heads)
     return (found.coupled_primitives, found.width, found.residuals, context, heads, found.head_bits)
 
 
@@ -140,6 +140,8 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         ({"lmbda": 1e-5, "passes": 44.99}, "residuals", False),
         ({"sightings": 9.0, "lmbda": 1e-5, "passes": 45.0}, "heads", "separate"),
         ({"sightings": 9.0, "lmbda": 2e-5, "passes": 45.0}, "heads", "paired"),
+        ({"anchors": 20_000}, "heads", "shallow"),
+        ({"anchors": 20_000, "points_at_hand": True}, "heads", "paired"),
         ({"lmbda": 0.001, "anchors": 3_400}, "width", 32),
         ({"lmbda": 0.001, "anchors": 3_333}, "width", 16),
         ({"lmbda": 0.01, "anchors": 6_000}, "width", 8),
