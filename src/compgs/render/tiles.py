@@ -164,7 +164,7 @@ def gather_splats(packed, entries, order, begin, end, splats, spans):
 
 @njit(inline="always")
 def scratch():
-    """[SCRATCH] zeros from the beginning of a cache line on: rows that lie in two of them take half as long again."""
+    """[SCRATCH] zeros from the beginning of a cache line on; from elsewhere, some processes took half as long again."""
     room = np.zeros(SCRATCH + CACHE_LINE, np.float32)
     skip = -(room.ctypes.data // room.itemsize) % CACHE_LINE
     return room[skip : skip + SCRATCH]
