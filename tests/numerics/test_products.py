@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from compgs.numerics.products import add_product, multiply
+from compgs.numerics.products import add_product, multiply, padded
 
 
 def made(*shape: int, seed: int = 0) -> np.ndarray:
@@ -34,6 +34,15 @@ def test_a_transposed_left_factor_is_read_where_it_is() -> None:
     x, y, out = made(130, 6), made(130, 20, seed=1), np.zeros((6, 20), np.float32)
     add_product(x.T, y, out)
     np.testing.assert_allclose(out, x.T.astype(np.float64) @ y, atol=1e-4)
+
+
+@pytest.mark.parametrize(("columns", "width"), [(1, 4), (4, 4), (7, 8), (8, 8), (10, 16), (42, 48)])
+def test_columns_of_zeros_change_no_bit_of_the_others(columns: int, width: int) -> None:
+    a, b = made(11, 9), made(9, columns, seed=1)
+    narrow, wide = made(11, columns), made(11, width)
+    multiply(a, b, narrow)
+    multiply(a, padded(b), wide)
+    assert np.array_equal(wide[:, :columns], narrow) and not wide[:, columns:].any()
 
 
 def test_nothing_summed_is_zero() -> None:

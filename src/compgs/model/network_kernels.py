@@ -7,15 +7,15 @@
 
 `H` is the hidden width, `O` the outputs, `G` the residual channels, `B` the blocks; `shared` [A, H + O] is the anchors'
 part of the first layer and of the skip, biases included, computed once per anchor. Coupled primitives are taken ROWS at
-a time, so that all activations of a group stay in the core's cache. Training has kernels of its own with gradients, on
-BLAS (`tensors/residual_mlp_kernels.py`); these need nothing but numba.
+a time, so that all activations of a group stay in the core's cache. Training has kernels of its own with gradients
+(`tensors/residual_mlp_kernels.py`).
 """
 
 import numpy as np
 
 from compgs.model.constants import NEGATIVE_SLOPE
 from compgs.numerics.compiled import chunk_of, njit
-from compgs.numerics.products import multiply
+from compgs.numerics.products import multiply, padded
 
 ANCHORS = 128  # in a block
 ROWS = 128  # primitives in a group: all activations of a group fit into the second-level cache
@@ -52,19 +52,6 @@ def tiled(biases):
             ):  # not a slice: what numba would say of other shapes takes two seconds to compile
                 tiles[b, i * H + c] = biases[b, c]
     return tiles
-
-
-@njit
-def padded(weight):
-    """weight [H, O] with columns of zeros, up to 4, 8 or a multiple of 16: products of other widths take longer than of
-    the next of these (`numerics/products.py`).
-    """
-    H, O = weight.shape
-    wide = np.zeros((H, 4 if O <= 4 else 8 if O <= 8 else (O + 15) // 16 * 16), np.float32)
-    for i in range(H):
-        for j in range(O):
-            wide[i, j] = weight[i, j]
-    return wide
 
 
 @njit(fastmath=FASTMATH)

@@ -11,6 +11,7 @@ number of rows nor on what else is computed.
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -165,3 +166,18 @@ def add_product(a, b, out):  # [N, K], [K, C], [N, C] float32; the columns of b 
         for i in range(len(a) - len(a) % NARROW_ROWS, len(a)):
             _add_row_by_1(a, b, out, i, j)
         j += 1
+
+
+@njit
+def padded(b):
+    """b [K, C] with columns of zeros, up to 4, 8 or a multiple of 16: products with other widths take longer than with
+    the next of these.
+    """
+    terms, columns = b.shape
+    wide = np.zeros(
+        (terms, 4 if columns <= 4 else 8 if columns <= 8 else (columns + 15) // 16 * 16), np.float32
+    )
+    for i in range(terms):
+        for j in range(columns):
+            wide[i, j] = b[i, j]
+    return wide

@@ -18,7 +18,7 @@ variables (rather than in the buffer) spare the compiled code a check for overla
 
 What is done at a pixel is one long chain of operations, each of which waits for the one before. So an entry's pixels
 are gone through two or three times, with a link of the chain each time: then the processor works at several rows at
-once. That and a scratch that begins where a cache line does save a fifth of the forward and a quarter of the backward
+once. That and a scratch that begins where a cache line does save a seventh of the forward and a quarter of the backward
 pass (docs/results/rasterizer.md).
 """
 

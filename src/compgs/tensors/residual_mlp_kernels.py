@@ -20,11 +20,10 @@ from compgs.model.network_kernels import (
     add_shared,
     add_two,
     chosen_rows,
-    padded,
     tiled,
 )
 from compgs.numerics.compiled import chunk_of, njit
-from compgs.numerics.products import add_product, multiply
+from compgs.numerics.products import add_product, multiply, padded
 
 CHUNKS = 16  # partial sums of a weight gradient
 
