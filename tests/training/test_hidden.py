@@ -22,13 +22,21 @@ def memory(share: float = 0.1, views: int = 3, anchors: int = 4) -> HiddenAnchor
     return HiddenAnchors(share, views, (anchors, K), CPU)
 
 
-def observed(
+def look(
     hidden: HiddenAnchors, rows: list[int], index: list[int], opacities: list[float], sizes: list[float]
-):
-    """What view 1 remembers after it has drawn primitives `index` of the anchors `rows`."""
+) -> None:
+    """View 1 draws primitives `index` of the anchors `rows`."""
     prediction = SimpleNamespace(index=torch.tensor(index), opacities=torch.zeros(K * len(rows)))
     gaussians = SimpleNamespace(opacities=torch.tensor(opacities))
     hidden.observe(1, torch.tensor(rows), prediction, gaussians, GradientSizes(torch.tensor(sizes)))
+
+
+def observed(
+    hidden: HiddenAnchors, rows: list[int], index: list[int], opacities: list[float], sizes: list[float]
+):
+    """What view 1 remembers after it has drawn primitives `index` of the anchors `rows` twice."""
+    for _ in range(2):
+        look(hidden, rows, index, opacities, sizes)
     return hidden.others(1, torch.arange(len(hidden.hidden))).tolist()
 
 
@@ -63,16 +71,30 @@ def test_other_views_and_later_looks_decide_for_themselves():
     assert observed(hidden, [0, 1], [0, 1, 2, 3], [0.5] * 4, [1.0, 1.0, 0.0, 0.0]) == [0, 2, 3]
 
 
+def test_an_anchor_is_hidden_after_two_looks_in_a_row_that_did_not_show_it():
+    hidden, everything = memory(anchors=1), torch.arange(1)
+    found = []
+    for shows in (False, True, False, False, False, True, False):
+        look(hidden, [0], [0, 1], [0.5] * 2, [float(shows)] * 2)
+        found.append(len(hidden.others(1, everything)) == 0)
+    assert found == [False, False, False, True, True, False, False]
+
+
 def test_memory_follows_anchors_that_come_and_go():
     hidden = memory()
-    observed(hidden, [0, 3], [0, 1, 6, 7], [0.5] * 4, [0.0] * 4)
+    observed(hidden, [0], [0, 1], [0.5] * 2, [0.0] * 2)
+    look(hidden, [3], [0, 1], [0.5] * 2, [0.0] * 2)
     hidden.replaced(torch.tensor([False, True, True, True]), 2)
+    assert hidden.others(1, torch.arange(5)).tolist() == [0, 1, 2, 3, 4]
+    look(hidden, [2], [0, 1], [0.5] * 2, [0.0] * 2)
     assert hidden.others(1, torch.arange(5)).tolist() == [0, 1, 3, 4]
+    hidden.replaced(torch.tensor([False, True, True, True, False]), 0)
+    assert hidden.others(1, torch.arange(3)).tolist() == [0, 2]
 
 
 def test_a_bit_is_kept_for_each_anchor_and_view_and_views_do_not_mix():
     hidden = memory(views=300, anchors=50)
-    assert hidden.hidden.numel() == 50 * 38 and hidden.hidden.element_size() == 1
+    assert all(bits.numel() == 50 * 38 and bits.element_size() == 1 for bits in hidden.tensors().values())
     chance = torch.Generator().manual_seed(0)
     expected = torch.zeros(50, 300, dtype=torch.bool)
     for view in (0, 7, 8, 9, 255, 299, 7, 8):
@@ -82,7 +104,8 @@ def test_a_bit_is_kept_for_each_anchor_and_view_and_views_do_not_mix():
         index = torch.arange(K * len(rows))
         prediction = SimpleNamespace(index=index, opacities=torch.zeros(len(index)))
         gaussians = SimpleNamespace(opacities=torch.full((len(index),), 0.5))
-        hidden.observe(view, rows, prediction, gaussians, GradientSizes(sizes))
+        for _ in range(2):
+            hidden.observe(view, rows, prediction, gaussians, GradientSizes(sizes))
         expected[rows, view] = found
     for view in range(300):
         shown = hidden.others(view, torch.arange(50))
@@ -111,11 +134,12 @@ def test_what_one_rank_remembers_comes_back_and_is_of_no_use_to_several():
     observed(one, [0, 3], [0, 1, 6, 7], [0.5] * 4, [0.0, 0.0, 1.0, 1.0])
     other.restore(one.tensors(), {})
     assert torch.equal(other.hidden, one.hidden) and one.hidden.any()
+    assert torch.equal(other.missed, one.missed)
     of_several = memory(share=0.0)
     of_several.restore(one.tensors(), {})
     assert of_several.others(1, torch.arange(4)).tolist() == [0, 1, 2, 3]
     other.restore(of_several.tensors(), {})
-    with pytest.raises(ValueError, match="hidden: expected"):
+    with pytest.raises(ValueError, match="missed: expected"):
         other.restore(memory(anchors=5).tensors(), {})
 
 
@@ -150,7 +174,8 @@ def test_a_view_hardly_changes_without_what_is_hidden_in_it(trainer):
     for number, view in enumerate(trainer.scene.train_views):
         rows = trainer.survey.visible_anchors(view.camera)
         looks = step_views([number], [rows], trainer.model.anchors, trainer.noise)
-        trainer.learn(looks, trainer.now)  # looks, and moves nothing
+        for _ in range(2):
+            trainer.learn(looks, trainer.now)  # looks, and moves nothing
         shown = trainer.hidden.others(number, rows)
         as_many = rows[torch.randperm(len(rows), generator=chance)[: len(shown)].sort().values]
         images = []

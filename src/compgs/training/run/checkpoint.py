@@ -23,7 +23,7 @@ from compgs.scene.views import Scene
 from compgs.training.run.restoring import check_step, restoring
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
-CHECKPOINT_VERSION = "11"
+CHECKPOINT_VERSION = "12"
 STAMP = ("format", "version", "method", "device")  # what every checkpoint says of itself
 
 

@@ -1,9 +1,13 @@
 """Anchors that a view does not show, though they are in its frustum: they stand behind others.
 
 A third of the anchors in view hardly show, and cost as much as the others until their gradients turn out to be nothing.
-Each view remembers which they were; its next steps pass them over. In every step with the rate (`rare_rate`), which
-counts the bits of all anchors in view, all are looked at again: on average at every fourth visit of a view
-(docs/results/tried.md). Before there is a rate, much is hidden now and seen soon: then all are looked at.
+Each view remembers which did not in its last two looks; its next steps pass them over. In every step with the rate
+(`rare_rate`), which counts the bits of all anchors in view, all are looked at again: on average at every fourth visit
+of a view (docs/results/tried.md). Before there is a rate, much is hidden now and seen soon: then all are looked at.
+
+One look is not enough. Where a large primitive happened to stand in front of a camera, nearly all is hidden behind it;
+the next steps would draw the view without, and change by its gradients parts that were right. In a run of Truck of
+2 400 steps, each view in twelve of them, that took 1.5 to 3 dB off a tenth of the run (docs/results/truck.md).
 
 What counts are the gradients by an anchor's primitives. Something that shows always has some: L1 pulls at every value
 by as much, however small the error is.
@@ -66,15 +70,16 @@ class _Measured(torch.autograd.Function):
 
 
 class HiddenAnchors:
-    """Remembers for each training view the anchors that hardly showed when it last looked at them."""
+    """Remembers for each training view the anchors that hardly showed in its last two looks at them."""
 
     def __init__(self, share: float, views: int, shape: tuple[int, int], device: torch.device) -> None:
         """`share`: of the mean gradient, below which an anchor is hidden; 0: none is. `shape`: N, K."""
         self.share = share
         anchors, self.coupled_primitives = shape
         remembered = views if self.share > 0.0 else 0
-        # [N, views / 8] a bit for each anchor and view: of a million anchors and 300 views 38 MB
-        self.hidden = torch.zeros(anchors, -(-remembered // 8), dtype=torch.uint8, device=device)
+        # [N, views / 8] a bit for each anchor and view, twice: of a million anchors and 300 views 76 MB
+        self.missed = torch.zeros(anchors, -(-remembered // 8), dtype=torch.uint8, device=device)  # last time
+        self.hidden = torch.zeros_like(self.missed)  # and the time before
 
     def others(self, view: int, rows: Tensor) -> Tensor:
         """Return the anchors among `rows` [V] int64 that are not hidden in a view."""
@@ -108,17 +113,21 @@ class HiddenAnchors:
                 self.share,
                 found.numpy(),
             )
-        bits = self.hidden[rows, view // 8] & (0xFF ^ (1 << view % 8))
-        self.hidden[rows, view // 8] = bits | (found.to(torch.uint8) << view % 8)
+        column, bit = view // 8, 1 << view % 8
+        missed, hidden = self.missed[rows, column], self.hidden[rows, column]
+        now = found.to(torch.uint8) << view % 8
+        self.hidden[rows, column] = (hidden & (0xFF ^ bit)) | (now & missed)
+        self.missed[rows, column] = (missed & (0xFF ^ bit)) | now
 
     def replaced(self, kept: Tensor, new: int) -> None:
         """Only the anchors `kept` [N] bool are left, and so many new ones follow."""
         none = self.hidden.new_zeros(new, self.hidden.shape[1])
+        self.missed = torch.cat([self.missed[kept], none])
         self.hidden = torch.cat([self.hidden[kept], none])
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors that a checkpoint holds."""
-        return {"hidden": self.hidden}
+        return {"missed": self.missed, "hidden": self.hidden}
 
     def state(self) -> dict[str, Any]:
         """Nothing beside the tensors."""
@@ -128,13 +137,13 @@ class HiddenAnchors:
         """Take back what a checkpoint holds; what one rank remembered is of no use to several, which remember nothing,
         nor the other way round. Raises ValueError, KeyError, IndexError for a damaged one.
         """
-        hidden = tensors["hidden"]
         anchors, columns = self.hidden.shape
-        if 0 in (columns, hidden.shape[-1]):
-            check_tensor(hidden[:, :0], (anchors, 0), torch.uint8, "hidden")
+        if 0 in (columns, tensors["hidden"].shape[-1]):
+            check_tensor(tensors["hidden"][:, :0], (anchors, 0), torch.uint8, "hidden")
             return
-        check_tensor(hidden, (anchors, columns), torch.uint8, "hidden")
-        self.hidden = hidden.to(self.hidden.device)
+        for name in ("missed", "hidden"):
+            check_tensor(tensors[name], (anchors, columns), torch.uint8, name)
+        self.missed, self.hidden = (tensors[name].to(self.hidden.device) for name in ("missed", "hidden"))
 
 
 @njit(error_model="numpy")
