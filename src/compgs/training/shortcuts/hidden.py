@@ -5,9 +5,9 @@ Each view remembers which did not in its last two looks; its next steps pass the
 (`rare_rate`), which counts the bits of all anchors in view, all are looked at again: on average at every fourth visit
 of a view (docs/results/tried.md). Before there is a rate, much is hidden now and seen soon: then all are looked at.
 
-One look is not enough. Where a large primitive happened to stand in front of a camera, nearly all is hidden behind it;
-the next steps would draw the view without, and change by its gradients parts that were right. In a run of Truck of
-2 400 steps, each view in twelve of them, that took 1.5 to 3 dB off a tenth of the run (docs/results/truck.md).
+One look is not enough: in a short run the scene is another before the next one. The view would be drawn without what
+has come into sight, and its gradients would change parts that are right. In a run of Truck of 2 400 steps, each view in
+twelve of them, that took 1.5 to 3 dB off the training views for a tenth of the run (docs/results/truck.md).
 
 What counts are the gradients by an anchor's primitives. Something that shows always has some: L1 pulls at every value
 by as much, however small the error is.
