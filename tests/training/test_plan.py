@@ -151,6 +151,8 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         ({"sightings": 17.0, "lmbda": 0.002}, "dilation", 0.02),
         ({"sightings": 16.0, "lmbda": 0.002}, "dilation", 0.3),
         ({"lmbda": 0.0021}, "dilation", 0.3),
+        ({"lmbda": 0.0021, "anchors": 20_000}, "dilation", 0.02),
+        ({"lmbda": 0.0021, "anchors": 20_000, "points_at_hand": True}, "dilation", 0.3),
         ({"sightings": 11.0}, "dropout", 0.2),
         ({"sightings": 22.0}, "dropout", 0.0),
         ({"sightings": 11.0}, "bit_discount", 0.5),

@@ -241,8 +241,8 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         "sharp", "dilation", lambda c, s, pixels: min(pixels, LEAST_DILATION),
-        "a point in 17 training views and more, lambda up to 0.002",
-        lambda s: not s.few and s.lmbda <= 0.002,
+        "a point in 17 training views and more, and lambda up to 0.002 or 20,000 anchors and more, no tile",
+        lambda s: not s.few and (s.dense or s.lmbda <= 0.002),
         "results/decisions.md",
     ),
     # Followed in a run, as lambda changes (`growth_factor`).
