@@ -3,7 +3,7 @@
 | file | saves |
 |---|---|
 | `coarse` | pixels: large photographs are halved until details are due |
-| `hidden` | anchors: those that stood behind others when a view last looked are passed over |
+| `hidden` | anchors: those that stood behind others in a view's last two looks are passed over |
 | `rare_rate` | bits: the rate is in the loss of every few steps, as many times |
 
 The rules of `compgs.training.plan` are the one gate: each has a name there (`coarse_photographs`, `hidden_anchors`,
