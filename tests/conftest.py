@@ -1,10 +1,12 @@
 """What tests of several rooms need: Ctrl-C that is heard, a scene to train, a small .cgs file, splats, a browser."""
 
+import os
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -25,6 +27,10 @@ def pytest_configure() -> None:
     # Whoever starts the tests in the background starts them with Ctrl-C ignored, and so their child processes.
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    # As many processes as cores run tests at once: dividing their small works further would only take time.
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        numba.set_num_threads(1)
+        torch.set_num_threads(1)
 
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -49,6 +55,24 @@ def random_splats() -> Callable[..., SplatArrays]:
         ).each(np.float32)
 
     return make
+
+
+@pytest.fixture
+def with_threads() -> Iterator[Callable[[int], None]]:
+    """`with_threads(2)`: from here to the end of the test, kernels and torch divide their work among two threads. Skips
+    the test where numba has fewer.
+    """
+    before, limit = (numba.get_num_threads(), torch.get_num_threads()), numba.config.NUMBA_NUM_THREADS
+
+    def use(threads: int) -> None:
+        if threads > limit:
+            pytest.skip(f"NUMBA_NUM_THREADS is {limit}: numba has no {threads} threads here")
+        numba.set_num_threads(threads)
+        torch.set_num_threads(threads)
+
+    yield use
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])
 
 
 @pytest.fixture(scope="session")

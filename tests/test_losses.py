@@ -109,15 +109,12 @@ def test_a_perfect_rendering_costs_nothing_and_has_no_gradient():
     assert x.grad.abs().max() <= 0.81 / x.numel()
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
-def test_gradients_are_the_same_bits_with_one_thread_and_with_several():
+def test_gradients_are_the_same_bits_with_one_thread_and_with_several(with_threads):
     rendering, photograph = pair(64, 90)
-    threads = numba.get_num_threads()
     results = []
-    for count in {1, threads}:
-        numba.set_num_threads(count)
+    for count in (1, 2):
+        with_threads(count)
         results.append(l1_and_ssim(rendering.float().numpy(), photograph.numpy(), 0.2, want_gradient=True))
-    numba.set_num_threads(threads)
     for other in results[1:]:
         assert results[0][:2] == other[:2]
         np.testing.assert_array_equal(results[0][2], other[2])

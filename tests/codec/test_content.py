@@ -1,10 +1,10 @@
 """Whole files: content -> bytes -> content, sizes against the tables' own code length, refusals."""
 
 import sys
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -303,17 +303,16 @@ def test_groups_take_their_cross_entropy(blocks: int) -> None:
         assert bits <= 8 * sizes[name] < 1.002 * bits + 64 * len(info.ranges), name
 
 
-def test_results_do_not_depend_on_threads_or_block_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_do_not_depend_on_threads_or_block_sizes(
+    monkeypatch: pytest.MonkeyPatch, with_threads: Callable[[int], None]
+) -> None:
     content = make_content(3000, 6, blocks=2, hidden=16)
+    with_threads(2)
     data = write_content(content)
-    threads = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
-        monkeypatch.setattr(integer_network, "BLOCK_ROWS", 77)
-        assert write_content(content) == data
-        assert_same(read_content(data), content)
-    finally:
-        numba.set_num_threads(threads)
+    with_threads(1)
+    monkeypatch.setattr(integer_network, "BLOCK_ROWS", 77)
+    assert write_content(content) == data
+    assert_same(read_content(data), content)
 
 
 def test_info_accounts_for_every_byte() -> None:

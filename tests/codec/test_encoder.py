@@ -195,21 +195,12 @@ def test_heads_of_another_layout_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_symbols_do_not_depend_on_the_number_of_threads(threads):
-    import numba
-
-    limit = numba.config.NUMBA_NUM_THREADS
-    if threads > limit:
-        pytest.skip(f"NUMBA_NUM_THREADS is {limit}: numba has no {threads} threads here")
+def test_symbols_do_not_depend_on_the_number_of_threads(threads, with_threads):
+    with_threads(3 - threads)
     data = write_content(to_content(made_model(900)))
-    numba.set_num_threads(threads)
-    torch.set_num_threads(threads)
-    try:
-        content = read_content(data)
-        assert write_content(content) == data
-    finally:
-        numba.set_num_threads(limit)
-        torch.set_num_threads(2)
+    with_threads(threads)
+    content = read_content(data)
+    assert write_content(content) == data
 
 
 def test_shared_residuals_are_in_the_file_though_no_symbol_is(tmp_path):

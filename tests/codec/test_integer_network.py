@@ -1,9 +1,9 @@
 """Integer networks: the float64 evaluation against int64, however it is cut, ordered or threaded."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -166,7 +166,10 @@ def test_accumulators_at_the_limit_are_exact() -> None:
     assert (evaluate(network, x) == slow_evaluate(network, x)).all()
 
 
-def test_results_do_not_depend_on_batch_order_or_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_do_not_depend_on_batch_order_or_threads(
+    monkeypatch: pytest.MonkeyPatch, with_threads: Callable[[int], None]
+) -> None:
+    with_threads(2)
     network = random_network(1, [42, 64, 64, 64, 160], skip=True, adds=True)
     rng = np.random.default_rng(2)
     x = rng.integers(-(1 << 18), 1 << 18, (20_000, 42)).astype(np.int32)
@@ -187,13 +190,9 @@ def test_results_do_not_depend_on_batch_order_or_threads(monkeypatch: pytest.Mon
         skip=True,
     )
     assert (evaluate(shuffled, x[:, columns]) == whole).all()
-    threads = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
-        monkeypatch.setattr(integer_network, "BLOCK_ROWS", 333)
-        assert (evaluate(network, x) == whole).all()
-    finally:
-        numba.set_num_threads(threads)
+    with_threads(1)
+    monkeypatch.setattr(integer_network, "BLOCK_ROWS", 333)
+    assert (evaluate(network, x) == whole).all()
 
 
 @pytest.mark.gpu

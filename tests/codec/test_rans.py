@@ -1,7 +1,8 @@
 """The entropy coder: round trips, rate, robustness, independence of threads."""
 
+from collections.abc import Callable
+
 import constriction
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -134,19 +135,14 @@ def test_rate_is_within_two_thousandths_of_constrictions_exact_gaussians() -> No
     assert ours < coder.num_bits() * 1.002
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
-def test_results_do_not_depend_on_the_number_of_threads() -> None:
+def test_results_do_not_depend_on_the_number_of_threads(with_threads: Callable[[int], None]) -> None:
     symbols, index = gaussian_symbols(2 * CHUNK_SYMBOLS + 17, 5)
     symbols[::100_003] = 1 << 19
-    threads = numba.get_num_threads()
     results = []
-    try:
-        for n in {1, threads}:
-            numba.set_num_threads(n)
-            data = encode_symbols(symbols, index, gaussian_tables())
-            results.append((data, decode_symbols(data, index, gaussian_tables()).tobytes()))
-    finally:
-        numba.set_num_threads(threads)
+    for threads in (1, 2):
+        with_threads(threads)
+        data = encode_symbols(symbols, index, gaussian_tables())
+        results.append((data, decode_symbols(data, index, gaussian_tables()).tobytes()))
     assert all(r == results[0] for r in results)
     assert results[0][1] == symbols.tobytes()
 

@@ -1,11 +1,11 @@
 """What symbols say about later ones of their row: against slow twins, and against what it should save."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -149,20 +149,18 @@ def gaussian_rows(
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize(("rows", "width"), [(1, 1), (3, 7), (400, 32), (40_000, 9), (160_000, 7)])
-def test_streams_whose_tables_follow_rows_come_back(rows: int, width: int, threads: int) -> None:
+def test_streams_whose_tables_follow_rows_come_back(
+    rows: int, width: int, threads: int, with_threads: Callable[[int], None]
+) -> None:
     """One state and two, rows that go on in the next chunk, escapes."""
     symbols, index = gaussian_rows(rows, width, 1, spread=0.8)
     symbols[:: max(1, rows // 5)] *= 1000
     symbols, index = symbols.ravel(), index.ravel()
     kind = Rows(width, 7)
-    before = numba.get_num_threads()
-    numba.set_num_threads(min(threads, before))
-    try:
-        data = encode_symbols(symbols, index, gaussian_tables(), kind)
-        kept = index.copy()
-        assert np.array_equal(decode_symbols(data, index, gaussian_tables(), rows=kind), symbols)
-    finally:
-        numba.set_num_threads(before)
+    with_threads(threads)
+    data = encode_symbols(symbols, index, gaussian_tables(), kind)
+    kept = index.copy()
+    assert np.array_equal(decode_symbols(data, index, gaussian_tables(), rows=kind), symbols)
     assert np.array_equal(index, kept), "the tables that were given have changed"
     bits = sum(escape_bits(symbols, index, gaussian_tables(), kind))
     assert 8 * len(data) == pytest.approx(bits, rel=0.001, abs=200)
@@ -242,13 +240,12 @@ def test_channels_that_have_nothing_in_common_get_no_chain() -> None:
     assert with_chain(network_of(alone[1]), coded_of(*alone)).rows.chain is None
 
 
-def test_a_chain_does_not_depend_on_the_number_of_threads() -> None:
+def test_a_chain_does_not_depend_on_the_number_of_threads(with_threads: Callable[[int], None]) -> None:
     steps, index = correlated(20_000, 7)
-    before, chains = numba.get_num_threads(), []
-    for threads in (1, before):
-        numba.set_num_threads(threads)
+    chains = []
+    for threads in (1, 2):
+        with_threads(threads)
         chains.append(with_chain(network_of(index), coded_of(steps, index)).rows.chain)
-    numba.set_num_threads(before)
     assert chains[0] is not None and np.array_equal(chains[0], chains[1])
 
 

@@ -2,7 +2,6 @@
 
 import re
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -91,15 +90,11 @@ def test_masked_slots_cost_nothing_and_pull_at_nothing():
     assert all(float(p.grad.abs().sum()) == 0.0 for p in net.parameters() if p.grad is not None)
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
-def test_bits_and_gradients_do_not_depend_on_the_number_of_threads():
-    threads = numba.get_num_threads()
+def test_bits_and_gradients_do_not_depend_on_the_number_of_threads(with_threads):
+    with_threads(2)
     many = run(torch.float32, bits=13, with_noise=True, masked=True)
-    try:
-        numba.set_num_threads(1)
-        one = run(torch.float32, bits=13, with_noise=True, masked=True)
-    finally:
-        numba.set_num_threads(threads)
+    with_threads(1)
+    one = run(torch.float32, bits=13, with_noise=True, masked=True)
     assert all(torch.equal(a, b) for a, b in zip(many, one, strict=True))
 
 

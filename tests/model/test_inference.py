@@ -1,6 +1,5 @@
 """The way from anchors in view to Gaussians by kernels on arrays, against plain torch in float64."""
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -105,14 +104,11 @@ def test_an_anchor_at_the_camera_has_finite_colors(layout):
     assert np.isfinite(model.gaussians(CAMERA).colors).all()
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
-def test_gaussians_do_not_depend_on_the_number_of_threads():
+def test_gaussians_do_not_depend_on_the_number_of_threads(with_threads):
     model = make_model(counts_with(200, 3))
+    with_threads(2)
     two = model.gaussians(CAMERA)
-    numba.set_num_threads(1)
-    try:
-        one = model.gaussians(CAMERA)
-    finally:
-        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    with_threads(1)
+    one = model.gaussians(CAMERA)
     for name in FIELDS:
         assert np.array_equal(getattr(one, name), getattr(two, name))

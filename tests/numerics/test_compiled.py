@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import numba
 import numpy as np
@@ -85,14 +85,11 @@ def fill(out, part):
 
 
 @pytest.fixture
-def threads() -> Iterator[int]:
+def threads(with_threads: Callable[[int], None]) -> int:
     """As many as there may be, two at least."""
-    before = numba.get_num_threads()
-    if numba.config.NUMBA_NUM_THREADS < 2:
-        pytest.skip("numba was started with one thread")
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    yield numba.get_num_threads()
-    numba.set_num_threads(before)
+    most = max(2, numba.config.NUMBA_NUM_THREADS)
+    with_threads(most)
+    return most
 
 
 def filled(count: int) -> np.ndarray:
@@ -109,13 +106,9 @@ def test_a_parallel_kernel_does_all_of_its_work_once_in_contiguous_parts(threads
         assert filled(count).tolist() == expected.tolist()
 
 
-def test_on_one_thread_there_is_one_part() -> None:
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        assert filled(5).tolist() == [10] * 5
-    finally:
-        numba.set_num_threads(before)
+def test_on_one_thread_there_is_one_part(with_threads: Callable[[int], None]) -> None:
+    with_threads(1)
+    assert filled(5).tolist() == [10] * 5
 
 
 def test_several_threads_may_call_parallel_kernels_at_once(threads: int) -> None:
@@ -163,9 +156,11 @@ def test_two_tasks_meet_on_two_threads(threads: int) -> None:
     assert sorted(Threads().both(meeting.wait, meeting.wait)) == [0, 1]
 
 
-def test_on_one_thread_two_tasks_come_one_after_the_other_and_an_error_ends_both(threads: int) -> None:
+def test_on_one_thread_two_tasks_come_one_after_the_other_and_an_error_ends_both(
+    with_threads: Callable[[int], None],
+) -> None:
     came: list[int] = []
-    numba.set_num_threads(1)  # (`threads` sets it back)
+    with_threads(1)
     Threads().both(lambda: came.append(threading.get_ident()), lambda: came.append(threading.get_ident()))
     assert came == [threading.get_ident()] * 2
     with pytest.raises(ZeroDivisionError):

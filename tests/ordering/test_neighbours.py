@@ -1,5 +1,6 @@
 """Neighbours against their definition: all known anchors, one after the other."""
 
+from collections.abc import Callable
 from itertools import product
 
 import numpy as np
@@ -58,19 +59,13 @@ def test_at_the_ends_of_the_largest_octree_neighbours_are_found() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_neighbours_do_not_depend_on_the_number_of_threads(threads: int) -> None:
-    import numba
-
-    limit = numba.config.NUMBA_NUM_THREADS
-    if threads > limit:
-        pytest.skip(f"NUMBA_NUM_THREADS is {limit}: numba has no {threads} threads here")
+def test_neighbours_do_not_depend_on_the_number_of_threads(
+    threads: int, with_threads: Callable[[int], None]
+) -> None:
     offsets, counts, depth = octree(1, 5000, 60)
     level = depth - 2
-    numba.set_num_threads(threads)
-    try:
-        found = find_neighbours(offsets, int(counts[level]), 2)
-    finally:
-        numba.set_num_threads(limit)
+    with_threads(threads)
+    found = find_neighbours(offsets, int(counts[level]), 2)
     mean = (found.around[found.node] >= 0).sum(1).mean()
     assert 2 < mean < AROUND
     total = int(found.around.astype(np.int64).sum()), int(found.node.astype(np.int64).sum())

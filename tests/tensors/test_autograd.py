@@ -1,6 +1,5 @@
 """Training's way through the kernels, Gaussians and gradients, against plain torch in float64."""
 
-import numba
 import pytest
 import torch
 
@@ -64,13 +63,10 @@ def test_primitives_without_gradient_are_passed_over_and_nothing_else_is(kept, l
         assert (found.double() - truth).abs().max() <= 2e-5 * truth.abs().max()
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
-def test_gradients_do_not_depend_on_the_number_of_threads():
+def test_gradients_do_not_depend_on_the_number_of_threads(with_threads):
+    with_threads(2)
     _, _, two = prediction(torch.float32)
-    numba.set_num_threads(1)
-    try:
-        _, _, one = prediction(torch.float32)
-    finally:
-        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    with_threads(1)
+    _, _, one = prediction(torch.float32)
     for a, b in zip(one[:3], two[:3], strict=True):
         assert torch.equal(a, b)

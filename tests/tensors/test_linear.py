@@ -1,4 +1,3 @@
-import numba
 import pytest
 import torch
 
@@ -22,17 +21,10 @@ def test_outputs_and_gradients_agree_with_float64_autograd(shape):
         torch.testing.assert_close(found.double(), truth, rtol=1e-5, atol=1e-5 * max(1, shape[0]) ** 0.5)
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core")
 @pytest.mark.parametrize("shape", [(4606, 42, 160), (4606, 4, 64), (46_060, 8, 8)], ids=str)
-def test_gradients_do_not_depend_on_the_number_of_threads(shape):
-    threads, numba_threads = torch.get_num_threads(), numba.get_num_threads()
+def test_gradients_do_not_depend_on_the_number_of_threads(shape, with_threads):
     results = []
-    try:
-        for count in (1, 2):
-            torch.set_num_threads(count)
-            numba.set_num_threads(count)
-            results.append(gradients(torch.float32, *shape))
-    finally:
-        torch.set_num_threads(threads)
-        numba.set_num_threads(numba_threads)
+    for count in (1, 2):
+        with_threads(count)
+        results.append(gradients(torch.float32, *shape))
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))

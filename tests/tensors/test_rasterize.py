@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -246,18 +245,12 @@ def test_splats_that_would_exhaust_memory_are_refused():
         rasterize(gaussians, camera)
 
 
-def test_the_same_bits_with_one_thread_and_with_two():
+def test_the_same_bits_with_one_thread_and_with_two(with_threads):
     camera, gaussians = make_camera(150, 90), make_gaussians(3, 700)
     results = []
-    before = numba.get_num_threads()
-    if numba.config.NUMBA_NUM_THREADS < 2:
-        pytest.skip("numba was started with one thread")
-    try:
-        for threads in (1, 2):
-            numba.set_num_threads(threads)
-            results.append(gradients(leaves(gaussians, torch.float32), camera, BACKGROUND))
-    finally:
-        numba.set_num_threads(before)
+    for threads in (1, 2):
+        with_threads(threads)
+        results.append(gradients(leaves(gaussians, torch.float32), camera, BACKGROUND))
     (one, one_gradients), (two, two_gradients) = results
     assert torch.equal(one.image, two.image)
     assert torch.equal(one.transmittance, two.transmittance)
