@@ -110,6 +110,7 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         "truck_adjusted_1e-3",
         "truck_adjusted_whole",
         "truck_adjusted_shallow",
+        "truck_adjusted_two_looks",
         "bonsai",
         "bonsai_default",
     ):
