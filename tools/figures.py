@@ -67,8 +67,6 @@ SUPERSEDED = (
     "truck_adjusted_whole",
     "bonsai",
 )
-# Records of today's decisions, but of a training that has changed since: an anchor was hidden after one look, not two.
-BEFORE_TWO_LOOKS = ("truck_adjusted_shallow",)
 # Of a run, said by its command; all else is the preset's.
 ASKED = ("lmbda", "steps", "seed", "target_bytes")
 Record = dict[str, Any]
@@ -129,8 +127,10 @@ def flat(settings: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def titled(record: Record, link: str) -> str:
-    """Return the name of the capture, and the commit if today's preset would train otherwise."""
-    otherwise = outdated(record) or record["name"] in BEFORE_TWO_LOOKS
+    """Return the name of the capture, and the commit if today's preset would train otherwise or a later record has its
+    place.
+    """
+    otherwise = outdated(record) or record["name"] in SUPERSEDED
     return link + (f", at {record['commit']}" if otherwise else "")
 
 
