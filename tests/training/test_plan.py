@@ -55,6 +55,14 @@ def capacity(found: Plan) -> tuple[int, ...]:
     return (found.coupled_primitives, found.width, found.residuals, context, heads, found.head_bits)
 
 
+def test_a_long_run_of_a_large_capture_counts_the_rate_half_as_often() -> None:
+    large = replace(USUAL, anchors=100_000, passes=25.0)
+    assert plan(Config(), large).rate_every == 8
+    shorter, smaller = replace(large, passes=24.9), replace(large, anchors=19_999)
+    for other in (shorter, smaller, replace(large, sightings=16.0), replace(large, points_at_hand=True)):
+        assert plan(Config(), other).rate_every == 4
+
+
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
 def test_a_rule_sets_a_value_of_the_plan_and_says_when_and_where_it_was_measured(rule) -> None:
     assert rule.sets in {each.name for each in fields(Plan)}
