@@ -179,7 +179,7 @@ class TrainingConfig:
     """Rate-distortion optimization (Sec. 3.4)."""
 
     # updates of the scene, each after `views_per_step` views; all schedules are shares of the steps (Ref.: 30 000; half
-    # of them train a large capture in one to two hours on two cores, docs/results/truck.md)
+    # of them train a large capture in about an hour on two cores, docs/results/truck.md)
     steps: Annotated[int, Range(1, 10_000_000)] = 15_000
     # views of a step, in all processes together (torchrun). Learning rates are multiplied by its root, and Adam's betas
     # raised to its power (`training/optimizers.py`). Divide `steps` by it to train on as many views in all.

@@ -119,6 +119,7 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         "truck_adjusted_whole",
         "truck_adjusted_shallow",
         "truck_adjusted_two_looks",
+        "truck_adjusted_rate8",
         "bonsai",
         "bonsai_default",
     ):
