@@ -3,7 +3,8 @@
 A third of the anchors in view hardly show, and cost as much as the others until their gradients turn out to be nothing.
 Each view remembers which did not in its last two looks; its next steps pass them over. In every step with the rate
 (`rare_rate`), which counts the bits of all anchors in view, all are looked at again: on average at every fourth visit
-of a view (docs/results/tried.md). Before there is a rate, much is hidden now and seen soon: then all are looked at.
+of a view, or every eighth (docs/results/tried.md). Before there is a rate, much is hidden now and seen soon: then all
+are looked at.
 
 One look is not enough: in a short run the scene is another before the next one. The view would be drawn without what
 has come into sight, and its gradients would change parts that are right. In a run of Truck of 2 400 steps, each view in
