@@ -55,6 +55,7 @@ FIRST = (
     "truck_adjusted",
     "truck_adjusted_1e-3",
     "truck_adjusted_default",
+    "bonsai_rate8",
     "bonsai_default",
     "bonsai_1e-3",
     "bonsai",
@@ -69,6 +70,7 @@ SUPERSEDED = (
     "truck_adjusted_default",
     "truck_adjusted_whole",
     "bonsai",
+    "bonsai_default",
 )
 # Of a run, said by its command; all else is the preset's.
 ASKED = ("lmbda", "steps", "seed", "target_bytes")
