@@ -45,6 +45,7 @@ BLOCK = re.compile(
 
 # The records that come first in the tables: the paper's scenes.
 FIRST = (
+    "truck_adjusted_30000",
     "truck_adjusted_rate8",
     "truck_adjusted_1e-2",
     "truck_adjusted_two_looks",
