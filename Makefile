@@ -1,5 +1,5 @@
 # make demo   a scene is made, trained, encoded, and its file decoded and judged in a new process: 1 1/2 minutes on two idle cores
-# make test   the tests of everyday work: five and a half minutes on two idle cores with AVX-512, eight and a half with AVX2
+# make test   the tests of everyday work: four to five and a half minutes on two idle cores with AVX-512, eight and a half with AVX2
 # make test-all   all tests; those that take long and guard what a change rarely breaks, too
 # make lint   style and types
 # make bounds the installation without extras, at the lowest versions that pyproject.toml allows, in a folder of its own
