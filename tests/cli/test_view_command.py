@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import webbrowser
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -68,3 +69,14 @@ def test_it_serves_a_page_until_it_is_stopped_and_says_no_more_than_where(
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
         assert (process.returncode, out, err) == (0, "ended\n", "")
+
+
+def test_an_interrupt_right_after_its_address_ends_it_as_well(
+    tiny_cgs: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(address: str) -> bool:
+        raise KeyboardInterrupt(address)
+
+    monkeypatch.setattr(webbrowser, "open", interrupted)
+    assert main(["view", str(tiny_cgs), "--port", "0", "--open"]) == 0
+    assert capsys.readouterr().out.endswith("ended\n")

@@ -50,8 +50,8 @@ class Serve(Command):
             ) from error
         with server:
             count = len(scene_files(self.folder.resolve()))
-            say(f"{count} {'file' if count == 1 else 'files'}: http://{self.host}:{server.server_port}/")
-            try:
+            try:  # whoever reads the address may end it at once
+                say(f"{count} {'file' if count == 1 else 'files'}: http://{self.host}:{server.server_port}/")
                 server.serve_forever()
             except KeyboardInterrupt:
                 say("ended")

@@ -70,12 +70,14 @@ class View(DecodingCommand, SceneFileOrRunArgument, LevelOption, MemoryOption):
         from compgs.viewer.stage import OwnThread
 
         shown = FileShown(file, chosen_device(self.device), self.background, self.level, self.max_splats)
-        with listening(shown, OwnThread(self.prepare), self.host, self.port) as viewer:
+        with (
+            listening(shown, OwnThread(self.prepare), self.host, self.port) as viewer,
+            contextlib.suppress(KeyboardInterrupt),  # whoever reads the address may end it at once
+        ):
             say(f"{file}: {viewer.address}")
             if self.open:
                 webbrowser.open(viewer.address)
-            with contextlib.suppress(KeyboardInterrupt):
-                threading.Event().wait()
+            threading.Event().wait()
         say("ended")
 
     def check_values(self) -> None:
