@@ -41,3 +41,18 @@ def test_it_serves_its_folder_until_it_is_stopped(
         assert connection.getresponse().read() == b"bytes"
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
+
+
+def test_an_interrupt_right_after_its_address_ends_it_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    def interrupted(text: str) -> None:
+        said.append(text)
+        if len(said) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("compgs.cli.serve.say", interrupted)
+    assert main(["serve", str(tmp_path), "--port", "0"]) == 0
+    assert len(said) == 2 and said[1] == "ended"

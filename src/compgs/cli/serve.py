@@ -1,5 +1,6 @@
 """`compgs serve`: a gallery of files in the browser."""
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -48,10 +49,8 @@ class Serve(Command):
                 f"--host {self.host} --port {self.port}: cannot be listened at ({error.strerror or error}); "
                 "give another one; --port 0 takes a free port"
             ) from error
-        with server:
-            count = len(scene_files(self.folder.resolve()))
-            try:  # whoever reads the address may end it at once
-                say(f"{count} {'file' if count == 1 else 'files'}: http://{self.host}:{server.server_port}/")
-                server.serve_forever()
-            except KeyboardInterrupt:
-                say("ended")
+        count = len(scene_files(self.folder.resolve()))
+        with server, contextlib.suppress(KeyboardInterrupt):  # whoever reads the address may end it at once
+            say(f"{count} {'file' if count == 1 else 'files'}: http://{self.host}:{server.server_port}/")
+            server.serve_forever()
+        say("ended")
