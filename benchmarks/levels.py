@@ -258,12 +258,16 @@ def main() -> None:
     parser.add_argument(
         "--plan", action="store_true", help="only bytes and splats of the walk, which take no time"
     )
+    parser.add_argument(
+        "--viewpoints", action="store_true", help="stop at the scene's own cameras, in place of the walk"
+    )
     parser.add_argument("--output", type=Path, help="folder for levels.json and pictures")
     options = parser.parse_args()
     devtools.MAX_SECONDS = MOST_SECONDS  # a page that draws by software may answer late
     width, height = map(int, options.size.split("x"))
-    cameras = [camera.resized(width, height) for camera in flight(options.city, options.stops + 1)[:-1]]
     manifest = read_manifest(options.city / MANIFEST)
+    stops = manifest.viewpoints if options.viewpoints else flight(options.city, options.stops + 1)[:-1]
+    cameras = [camera.resized(width, height) for camera in stops[: options.stops]]
     tiles, offset = manifest.tiles, np.array(manifest.world_offset)
     print(
         f"{len(tiles)} tiles, {sum(t.coupled_primitives for t in tiles):,} coupled primitives, "

@@ -2,6 +2,7 @@
 
     python benchmarks/tiles.py seam ONE TWO SCENE [-r 1]
     python benchmarks/tiles.py city FILE.cgs [--side 12] [--largest 0.8] [--memory 60MB] [--frames 48] [--folder DIR]
+    python benchmarks/tiles.py whole FILE.cgs OUT.cgs [--side 8] [--largest 0.8]
 
 `seam`: ONE is the run of a scene trained whole, TWO that of the same in tiles. Held-out views of both against the
 photographs: all pixels, and those that show what is near a border. Which these are the scene trained whole says: its
@@ -10,6 +11,8 @@ Gaussians are drawn white where they are near a border and black elsewhere.
 `city`: the middle of a trained file, repeated on a grid, each tile with its own world offset, as captures side by side
 would be. A camera flies over it, in one process with a bounded cache and in another with all tiles open: peak memory,
 and processor time of each picture. Pictures are compared bit by bit.
+
+`whole`: such a city in one file, for `compgs export OUT.cgs OUT.tiles`.
 """
 
 import argparse
@@ -31,20 +34,23 @@ import numpy as np
 from compgs import metrics
 from compgs.cameras import Camera
 from compgs.cli.sizes import parse_size
+from compgs.codec.content import FileContent, dequantize, reordered
 from compgs.codec.decoder import decode_bytes
 from compgs.codec.reader import read_content
-from compgs.codec.reduce import without_coupled
+from compgs.codec.reduce import with_latents, without_coupled
 from compgs.codec.writer import write_content
 from compgs.evaluation.camera_path import look_at
 from compgs.formats.tiled import read_manifest
+from compgs.formats.tiled_ground import Ground, contains
 from compgs.formats.tiled_scene import open_tiles
 from compgs.formats.tiled_writer import NewTile, write_tiles
 from compgs.opening import open_scene
+from compgs.ordering.order import canonical_order
+from compgs.outputs import write_bytes
 from compgs.render import RasterSettings, local_camera, rasterize, render, visible_mask
 from compgs.scene import load_scene
 from compgs.tiles import Plan, read_plan
 from compgs.tiles.ground import ground_of
-from compgs.tiles.plan import contains
 
 NEAR = 0.1  # of the narrowest core's side across a border, to both sides of it
 CORE_SHARE = 0.7  # of the anchors, those nearest to the middle on the ground, that become a tile of the city
@@ -110,9 +116,10 @@ def decibels(squares: float) -> float:
 # a city ------------------------------------------------------------------------------------------------------------
 
 
-def make_city(file: Path, folder: Path, side: int, largest: float = math.inf) -> None:
-    """`side` x `side` times the middle of a file, without anchors that reach farther than `largest` world units: walls
-    and skies of so many captures would stand in front of each other.
+def middle_of(file: Path, largest: float) -> tuple[FileContent, Ground, np.ndarray, np.ndarray]:
+    """The middle of a file, without anchors that reach farther than `largest` world units: walls and skies of so many
+    captures would stand in front of each other. Its ground, and how far the next one lies to its right and forward,
+    world units.
     """
     data = file.read_bytes()
     model, content = decode_bytes(data, file), read_content(data)
@@ -121,15 +128,44 @@ def make_city(file: Path, folder: Path, side: int, largest: float = math.inf) ->
     half = float(np.quantile(places, CORE_SHARE))
     inside = (places <= half) & (model.bounds[1] < largest)
     tile = without_coupled(content, np.repeat(inside, content.mask.sum(1)))
-    right, forward = 2 * half * np.array(ground.right), 2 * half * np.array(ground.forward)
+    return tile, ground, 2 * half * np.array(ground.right), 2 * half * np.array(ground.forward)
+
+
+def make_city(file: Path, folder: Path, side: int, largest: float = math.inf) -> None:
+    """`side` x `side` times the middle of a file, a tile each."""
+    tile, ground, right, forward = middle_of(file, largest)
 
     def tiles() -> Iterator[NewTile]:
         for i in range(side):
             for j in range(side):
-                x, y, z = (np.array(content.world_offset) + i * right + j * forward).tolist()
+                x, y, z = (np.array(tile.world_offset) + i * right + j * forward).tolist()
                 yield NewTile(f"{i}_{j}", write_content(replace(tile, world_offset=(x, y, z))))
 
     write_tiles(folder, tiles(), ground)
+
+
+def make_whole(file: Path, out: Path, side: int, largest: float) -> None:
+    """The same in one file, moved by whole voxels; of two anchors in one voxel the first stays."""
+    tile, _, right, forward = middle_of(file, largest)
+    tile = reordered(tile, canonical_order(tile.coordinates))
+    latents = dequantize(tile)
+    shifts = [
+        np.rint((i * right + j * forward) / tile.voxel_size).astype(np.int32)
+        for i in range(side)
+        for j in range(side)
+    ]
+    every = np.concatenate([tile.coordinates + shift for shift in shifts])
+    chosen = np.sort(np.unique(every, axis=0, return_index=True)[1])
+    chosen = chosen[canonical_order(every[chosen])]
+    source = chosen % len(tile.coordinates)
+    city = replace(
+        tile,
+        coordinates=every[chosen],
+        mask=tile.mask[source],
+        groups=tuple(replace(group, symbols=group.symbols[source]) for group in tile.groups),
+        levels=None,
+    )
+    write_bytes(out, write_content(with_latents(city, [rows[source] for rows in latents])))
 
 
 def flight(folder: Path, frames: int) -> list[Camera]:
@@ -137,6 +173,8 @@ def flight(folder: Path, frames: int) -> list[Camera]:
     manifest = read_manifest(folder / "manifest.json")
     up = np.array(manifest.up)
     middles = np.array([tile.world_offset for tile in manifest.tiles])
+    if len(np.unique(middles, axis=0)) == 1:  # of one file
+        middles = middles + np.array([np.median(tile.spheres[:, :3], axis=0) for tile in manifest.tiles])
     start, end = middles[0], middles[-1]
     ahead = (end - start) / np.linalg.norm(end - start)
     block = np.linalg.norm(end - start) / (math.isqrt(len(middles)) - 1) / math.sqrt(2)
@@ -248,8 +286,15 @@ def main() -> None:
     three.add_argument("folder", type=Path)
     three.add_argument("--memory", type=int)
     three.add_argument("--frames", type=int, default=48)
+    four = commands.add_parser("whole")
+    four.add_argument("file", type=Path)
+    four.add_argument("out", type=Path)
+    four.add_argument("--side", type=int, default=8)
+    four.add_argument("--largest", type=float, default=math.inf)
     options = parser.parse_args()
-    if options.command == "seam":
+    if options.command == "whole":
+        make_whole(options.file, options.out, options.side, options.largest)
+    elif options.command == "seam":
         seam(options.one, options.two, options.scene, options.r)
     elif options.command == "city":
         city(options)

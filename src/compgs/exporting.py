@@ -24,6 +24,9 @@ from compgs.evaluation.importance import splat_importance
 from compgs.formats import WRITERS, SplatArrays, levels, sog_streamed, sog_streamed_writer, spz, told
 from compgs.formats.baking import Baked, bake
 from compgs.formats.refining import refine as refine_splats
+from compgs.formats.tiled import SUFFIX as TILES
+from compgs.formats.tiled_division import divide_file
+from compgs.formats.tiled_ground import parse_grid
 from compgs.formats.tiled_scene import TiledScene
 from compgs.formats.writing import KEEP_WORLD_OFFSET
 from compgs.model.degrees import MAX_DEGREE
@@ -31,7 +34,7 @@ from compgs.model.hybrid_model import HybridModel
 from compgs.model.splats import SplatModel
 from compgs.notes import note
 from compgs.opening import format_of, open_scene, scene_file
-from compgs.outputs import check_output_file, write_bytes
+from compgs.outputs import check_output_file, check_output_folder, write_bytes
 from compgs.paths import as_path
 from compgs.progress import counted
 from compgs.render import RasterSettings, Renderable, render, settings_of
@@ -59,7 +62,7 @@ class Exported:
     """What was written, and how far its pictures are from those of the scene it was made from."""
 
     bytes: int
-    splats: int | None  # None: the page holds the scene itself
+    splats: int | None  # None: the page, or the folder of tiles, holds the scene itself
     degree: int | None  # of their harmonics
     dropped: int  # splats that were left out for the file to be small enough
     psnr: tuple[float, ...]  # dB, 8-bit images, of each camera; infinite where nothing changed
@@ -68,6 +71,7 @@ class Exported:
     softer: bool = False  # whether other programs draw the splats softer than the scene is
     # Steps in which splats that were made anew were fitted to the scene's pictures; None: none were made anew.
     refined: int | None = None
+    tiles: int = 0  # of a folder of tiles
 
     @property
     def mean(self) -> float:
@@ -96,12 +100,14 @@ def export(
     max_bytes: int | None = None,
     spz_version: int = 3,
     level: int | None = None,
+    grid: str | None = None,
     overwrite: bool = False,
     device: "Device | None" = None,
     progress: Callable[[int, int], None] | Literal[False] | None = None,
 ) -> Exported:
     """Write a scene, or the one in a file, as `.ply`, `.spz`, `.sog` or `.glb`, or as a web page (`.html`), by what the
-    path ends in; as `lod-meta.json`, a streamed .sog of several levels of detail, with its parts in folders beside it.
+    path ends in; as `lod-meta.json`, a streamed .sog of several levels of detail, with its parts in folders beside it;
+    as a folder `.tiles`, of which viewers fetch what they look at: it has the primitives of a .cgs file as they are.
 
     Of a .cgs file opacity and color are baked to harmonics of `degree` over the cameras that the file holds and more
     between them. Of files of splats, harmonics above `degree` are left out. With `max_splats` or `max_bytes` those
@@ -110,7 +116,7 @@ def export(
     scene's own renderings. Files of splats that nothing is asked of keep every number.
 
     `.spz` files are of version 3, or of 4, which fewer programs read and which needs the package zstandard.
-    `level` is that of a streamed .sog (`lod-meta.json`), 0 the finest.
+    `level` is that of a streamed .sog (`lod-meta.json`), 0 the finest. `grid`: columns and rows of tiles ("4x2").
     `progress(done, total)` counts cameras and steps.
 
     Raises ConfigError, BitstreamError, SplatFileError, OutputError, MissingDependency.
@@ -121,10 +127,18 @@ def export(
     if spz_version not in spz.WRITTEN_VERSIONS:
         raise ConfigError(f"spz_version = {spz_version}: expected one of {spz.WRITTEN_VERSIONS}")
     kind = path.suffix.lower().removeprefix(".")
-    is_streamed = path.name == sog_streamed.NAME
-    if kind not in (*WRITERS, HTML) and not is_streamed:
+    is_streamed, is_tiled = path.name == sog_streamed.NAME, path.suffix == TILES
+    if kind not in (*WRITERS, HTML) and not is_streamed and not is_tiled:
         kinds = ", ".join(f".{name}" for name in (*WRITERS, HTML))
-        raise OutputError(f"{path}: expected a name that ends in {kinds}, or {sog_streamed.NAME}")
+        raise OutputError(f"{path}: expected a name that ends in {kinds} or {TILES}, or {sog_streamed.NAME}")
+    if is_tiled:
+        limits.check_none(path)
+        check_output_folder(path, overwrite=overwrite)
+        return _export_tiles(as_path(source, "source"), path, grid or "auto")
+    if grid is not None:
+        raise ConfigError(
+            f"grid = {grid}: only folders of tiles have one; give it with a name that ends in {TILES}"
+        )
     check_output_file(path, overwrite=overwrite)
     if kind == HTML:
         limits.check_none(path)
@@ -457,6 +471,16 @@ def _fitted(cameras: Sequence[Camera]) -> list[Camera]:
     """Cameras to bake through: a scene's own, and more between them."""
     more = between(cameras, max(0, FITTED_CAMERAS - len(cameras)))
     return [smaller(camera) for camera in (*cameras, *more)]
+
+
+def _export_tiles(source: Path, path: Path, grid: str) -> Exported:
+    """A folder of tiles with the primitives of a .cgs file. Raises BitstreamError, ConfigError, OutputError."""
+    found = format_of(source)
+    if found.name != "cgs":
+        raise NotACompGSFile(f"{source}: tiles are made of a .cgs file, found a .{found.name}")
+    count = divide_file(source.read_bytes(), source, path, parse_grid(grid))
+    size = sum(file.stat().st_size for file in path.iterdir())
+    return Exported(size, None, None, 0, (), (0.0, 0.0, 0.0), tiles=count)
 
 
 def _export_page(source: Path, path: Path) -> Exported:

@@ -80,6 +80,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     finally:
         patch.undo()
     shutil.copy(folder / "runs" / "garden" / "garden.cgs", folder / "garden.cgs")
+    shutil.copy(ROOT / "tests" / "golden" / "default.cgs", folder / "city.cgs")
     shutil.copy(folder / "runs" / "plain" / "plain.ply", folder / "scene.ply")
     shutil.copy(folder / "runs" / "plain" / "plain.ply", folder / "garden.ply")
     shutil.copy(folder / "runs" / "plain" / "plain.ply", folder / "before.ply")

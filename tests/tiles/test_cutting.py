@@ -9,8 +9,8 @@ import torch
 from compgs.config import Config, ModelConfig
 from compgs.errors import TrainingError
 from compgs.formats.tiled import Core
+from compgs.formats.tiled_ground import Ground
 from compgs.tiles import Tile, cut_to_core
-from compgs.tiles.ground import Ground
 from compgs.trained_model import TrainedModel
 
 ENDLESS = (-math.inf, math.inf)

@@ -12,12 +12,12 @@ from compgs.cameras import Camera
 from compgs.errors import CheckpointError, ConfigError, SceneError
 from compgs.evaluation.camera_path import look_at
 from compgs.formats.tiled import Core
+from compgs.formats.tiled_ground import contains, cuts, parse_grid
 from compgs.scene.sight import depths_in
 from compgs.scene.views import Points, Scene, View
 from compgs.tiles import block as block_module
-from compgs.tiles import block_scene, grid_for, parse_grid, plan_tiles, read_plan, write_plan
+from compgs.tiles import block_scene, grid_for, plan_tiles, read_plan, write_plan
 from compgs.tiles.ground import ground_of
-from compgs.tiles.plan import contains, cuts
 from compgs.tiles.sight import shares_of_picture, times_seen
 
 PIXELS = np.zeros((40, 60, 3), np.uint8)

@@ -288,7 +288,8 @@ def test_a_viewer_shows_tiles(city: Path) -> None:
     shown = FileShown(city / "city.tiles", "cpu")
     assert shown.title == "city.tiles" and len(shown.levels) == 1
     assert shown.levels[0].startswith("all of it: ")
-    assert isinstance(shown.model(0), TiledScene) and len(shown.cameras) == 12
+    assert isinstance(shown.model(0), TiledScene)
+    assert len(shown.cameras) == 8  # of the training, once, though both tiles have them
     assert sum(component_bytes(city / "city.tiles").values()) > 5000
 
 

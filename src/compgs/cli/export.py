@@ -20,11 +20,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Export(DecodingCommand, SceneFileArgument, LevelOption):
-    """Write a scene as plain splats (.ply, .spz, .sog, .glb), levels of detail (lod-meta.json), or a web page (.html).
+    """Write a scene as splats (.ply, .spz, .sog, .glb), levels (lod-meta.json), a web page (.html) or tiles (.tiles).
 
     In a .cgs file opacity and color depend on where one stands; other programs know harmonics. They are fitted
     over the cameras that the file holds, and what that costs is measured: the new file is read again and its
-    pictures are compared with those of the scene. Files of splats of any kind are converted, too.
+    pictures are compared with those of the scene. Files of splats of any kind are converted, too. A page holds the
+    .cgs file itself; a folder of tiles has its primitives as they are, and viewers fetch of it what they look at.
 
     Examples
 
@@ -37,6 +38,8 @@ class Export(DecodingCommand, SceneFileArgument, LevelOption):
     compgs export city/lod-meta.json city.ply --level 2
 
     compgs export garden.cgs garden/lod-meta.json
+
+    compgs export garden.cgs garden.tiles --grid 4x2
     """
 
     output: Annotated[Positional[Path], arg(metavar="OUT")]
@@ -58,6 +61,9 @@ class Export(DecodingCommand, SceneFileArgument, LevelOption):
     spz_version: Literal[3, 4] = 3
     """Version of .spz files: 4 is a little smaller, and read by newer programs only (needs `pip install '.[spz]'` in
     the project's folder)."""
+
+    grid: Annotated[str | None, arg(metavar="CxR", help_behavior_hint=NO_DEFAULT)] = None
+    """Columns and rows of tiles, for OUT.tiles; by default tiles of about 20,000 anchors."""
 
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace OUT if it is there already."""
@@ -83,6 +89,7 @@ class Export(DecodingCommand, SceneFileArgument, LevelOption):
                 max_bytes=most,
                 spz_version=self.spz_version,
                 level=self.level,
+                grid=self.grid,
                 overwrite=self.overwrite,
                 device=self.device,
                 progress=progress,
@@ -93,6 +100,11 @@ class Export(DecodingCommand, SceneFileArgument, LevelOption):
 
 def report(source: Path, path: Path, exported: "Exported") -> list[str]:
     """What was written, and what it costs, in words."""
+    if exported.tiles:
+        return [
+            f"{path}: {size(exported.bytes)} in {exported.tiles:,} tiles, with the primitives of {source.name} as they "
+            f"are; that file has {size(source.stat().st_size)}"
+        ]
     if exported.splats is None:
         return [f"{path}: {size(exported.bytes)}, a page that shows {source.name} without anything else"]
     splats = f"{exported.splats:,} splats of degree {exported.degree}"

@@ -66,7 +66,7 @@ def cut(model: Any, settings: RunSettings) -> None:
 
 def _ground_and_tile(entry: dict[str, Any]) -> tuple[Any, Any]:
     """Raises CheckpointError for what is none."""
-    from compgs.tiles.ground import Ground
+    from compgs.formats.tiled_ground import Ground
     from compgs.tiles.plan import Tile
 
     try:

@@ -42,7 +42,8 @@ def with_time(settings: RunSettings, scene: "Scene", seconds: float, device: str
 
 def tiles_of(grid: str, scene: "Scene") -> int:
     """How many tiles a capture is divided into."""
-    from compgs.tiles.plan import grid_for, parse_grid
+    from compgs.formats.tiled_ground import parse_grid
+    from compgs.tiles.plan import grid_for
 
     columns, rows = parse_grid(grid) or grid_for(scene)
     return columns * rows

@@ -93,7 +93,7 @@ class Tiles(TrainingCommand):
 
     def settings_of_new(self) -> RunSettings:
         """Return the command line's settings. Raises UsageError, CheckpointError."""
-        from compgs.tiles.plan import parse_grid
+        from compgs.formats.tiled_ground import parse_grid
 
         self.check_processors()
         if self.tile is not None:
@@ -173,7 +173,8 @@ class Tiles(TrainingCommand):
         self, settings: RunSettings, scene: "Scene", folder: Path
     ) -> "tuple[Plan, RunSettings]":
         """The run's plan, made and written unless there is one to continue with; and the settings with its grid."""
-        from compgs.tiles.plan import PLAN_NAME, grid_for, parse_grid, plan_tiles, read_plan, write_plan
+        from compgs.formats.tiled_ground import parse_grid
+        from compgs.tiles.plan import PLAN_NAME, grid_for, plan_tiles, read_plan, write_plan
 
         assert settings.tiles is not None
         if self.resume and (folder / PLAN_NAME).is_file():

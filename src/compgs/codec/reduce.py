@@ -1,13 +1,13 @@
-"""A smaller file from a file, without training: fewer coupled primitives, coarser covariances.
+"""A smaller file from a file, without training: fewer coupled primitives, coarser covariances, a part of the anchors.
 
-Both work on what the file holds and leave alone what other symbols are conditioned on: references and hyperpriors keep
+All work on what the file holds and leave alone what other symbols are conditioned on: references and hyperpriors keep
 their symbols, so that everything that is kept decodes to what it was. Only where anchors see neighbours, and some of
 these go, are there other symbols for the same. Residual embeddings keep their step: most
 of their symbols are 0, 1 or -1, and a coarser step either leaves those where they are or loses them all (measured in
 docs/results/tried.md).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,6 +35,30 @@ def without_coupled(content: FileContent, kept: np.ndarray) -> FileContent:
     """The content with only the coupled primitives that are `kept`, [P] bool in the file's order, and their anchors."""
     mask = content.mask.copy()
     mask[mask] = kept
+    latents = dequantize(content) if _sees_neighbours(content) else None
+    return _with_mask(content, mask, latents)
+
+
+def divided(content: FileContent, part_of: np.ndarray) -> Iterator[FileContent]:
+    """The parts of a content, in the order of their numbers: each has the anchors that are given its number, but for
+    those without a coupled primitive. Every part has to have one.
+
+    part_of: [N] int, of the file's anchors; what is negative goes into no part.
+    """
+    latents = dequantize(content) if _sees_neighbours(content) else None
+    for number in np.unique(part_of[part_of >= 0]):
+        yield _with_mask(content, content.mask & (part_of == number)[:, None], latents)
+
+
+def _sees_neighbours(content: FileContent) -> bool:
+    return any(group.shape.sees_neighbours for group in content.groups)
+
+
+def _with_mask(content: FileContent, mask: np.ndarray, latents: Sequence[np.ndarray] | None) -> FileContent:
+    """The content with the coupled primitives of the mask [N, K], and the anchors that have any.
+
+    `latents`: `dequantize` of the content, where a group sees neighbours.
+    """
     anchors = mask.any(1)
 
     def narrowed(group: Group) -> Group:
@@ -50,17 +74,17 @@ def without_coupled(content: FileContent, kept: np.ndarray) -> FileContent:
         groups=tuple(map(narrowed, content.groups)),
         levels=None,  # the octree may be another one
     )
-    if not any(group.shape.sees_neighbours for group in content.groups):
+    if latents is None:
         return smaller
     order = canonical_order(smaller.coordinates)
-    latents = [
+    own = [
         x if group.shape.role == Role.RESIDUAL else x[anchors][order]
-        for group, x in zip(content.groups, dequantize(content), strict=True)
+        for group, x in zip(content.groups, latents, strict=True)
     ]
-    return _around_others(reordered(smaller, order), latents)
+    return with_latents(reordered(smaller, order), own)
 
 
-def _around_others(content: FileContent, latents: Sequence[np.ndarray]) -> FileContent:
+def with_latents(content: FileContent, latents: Sequence[np.ndarray]) -> FileContent:
     """The content, in canonical order, with the symbols that have these latents (Q12; of RESIDUAL groups any) though
     other neighbours are there. They exist: latents lie whole steps from what neighbours cannot change.
     """

@@ -12,7 +12,7 @@ by their first bytes.
 | .glb, .gltf, KHR_gaussian_splatting | yes | .glb | 240 |
 | .ksplat, GaussianSplats3D | yes | no | 24 to 140, degree 2 at most |
 | .splat | yes | no | 32, no harmonics |
-| manifest.json of tiles, .cgs files | yes | by `write_tiles` | |
+| manifest.json of tiles, .cgs files | yes | by `write_tiles`, `compgs.export` | |
 | .packed, of a method of the comparison | yes | by `compgs.methods.write` | |
 """
 

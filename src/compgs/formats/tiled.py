@@ -108,7 +108,7 @@ class Manifest:
             "angular_dilation": self.angular_dilation,
             "up": list(self.up),
             "ground": None if self.ground is None else ground_entry(self.ground),
-            "viewpoints": [_camera_entry(camera) for camera in self.viewpoints],
+            "viewpoints": [camera_entry(camera) for camera in self.viewpoints],
             "tiles": [_tile_entry(tile) for tile in self.tiles],
         }
         head = {"format": KIND, "version": VERSION, "checksum": _checksum(content)}
@@ -249,7 +249,7 @@ def ground_from_entry(entry: dict[str, Any]) -> GroundAxes:
     return GroundAxes(*(_vector(entry[name]) for name in ("origin", "right", "forward")))
 
 
-def _camera_entry(camera: Camera) -> dict[str, Any]:
+def camera_entry(camera: Camera) -> dict[str, Any]:
     """Digits for a thousandth of the rounding that files of tiles have for their own viewpoints."""
     pose = np.asarray(camera.world_to_camera, np.float64).tolist()
     lens = {name: shortened(getattr(camera, name), 9) for name in ("fx", "fy", "cx", "cy")}

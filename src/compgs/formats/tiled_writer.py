@@ -1,6 +1,7 @@
 """A folder of tiles from .cgs files: each is looked at once, to know where it lies and what it takes."""
 
 import hashlib
+import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from compgs.formats.tiled import (
     Manifest,
     TileEntry,
     Vector,
+    camera_entry,
 )
 from compgs.formats.tiled_scene import resident_bytes
 from compgs.model.hybrid_model import HybridModel
@@ -176,10 +178,13 @@ def _mean_direction(directions: Sequence[Vector]) -> Vector:
 
 
 def _in_turns(viewpoints: Sequence[tuple[Camera, ...]]) -> tuple[Camera, ...]:
-    """The best of each tile, then the second of each, and so on."""
+    """The best of each tile, then the second of each, and so on. Tiles of one file have the same ones, which count
+    once.
+    """
     most = min(max(FEWEST_VIEWPOINTS, len(viewpoints)), MOST_VIEWPOINTS)
     rounds = (camera for each in zip_longest(*viewpoints) for camera in each if camera is not None)
-    return tuple(camera for camera, _ in zip(rounds, range(most), strict=False))
+    different = {json.dumps(camera_entry(camera)): camera for camera in rounds}
+    return tuple(different.values())[:most]
 
 
 def _remove(files: Iterable[Path]) -> None:

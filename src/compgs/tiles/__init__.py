@@ -6,13 +6,14 @@ plan.py       the division: cores, margins, views  block.py     the capture as o
 cutting.py    a trained tile without its margins   jobs.py      a run for each tile, and all of them merged
 ```
 
+Rectangles on the ground are those of `compgs.formats.tiled_ground`, by which files are divided, too.
 `compgs.formats.tiled` is what comes out: a folder of .cgs files that is opened tile by tile.
 """
 
 from compgs.tiles.block import block_scene
 from compgs.tiles.cutting import cut_to_core
 from compgs.tiles.jobs import TileJob, forget, merge, run_tiles, tile_jobs
-from compgs.tiles.plan import Plan, Tile, grid_for, parse_grid, plan_tiles, read_plan, write_plan
+from compgs.tiles.plan import Plan, Tile, grid_for, plan_tiles, read_plan, write_plan
 
 __all__ = [
     "Plan",
@@ -23,7 +24,6 @@ __all__ = [
     "forget",
     "grid_for",
     "merge",
-    "parse_grid",
     "plan_tiles",
     "read_plan",
     "run_tiles",

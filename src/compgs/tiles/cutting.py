@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from compgs.errors import TrainingError
-from compgs.tiles.ground import Ground
-from compgs.tiles.plan import Tile, contains
+from compgs.formats.tiled_ground import Ground, contains
+from compgs.tiles.plan import Tile
 
 
 def cut_to_core(model: Any, ground: Ground, tile: Tile) -> None:

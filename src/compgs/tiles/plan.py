@@ -6,10 +6,8 @@ A tile holds the anchors in its core, and is trained with the points of its padd
 outer cores have no end: the sky and the far background are theirs.
 """
 
-import itertools
 import json
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,21 +18,20 @@ import numpy as np
 from compgs.cameras import Camera
 from compgs.errors import CheckpointError, ConfigError
 from compgs.formats.tiled import Core, core_entry, core_from_entry, ground_entry
+from compgs.formats.tiled_ground import Ground, contains, cores_of, grid_of, sides
 from compgs.outputs import write_json
 from compgs.scene.points import MIN_POINTS, median_spacing
 from compgs.scene.views import Scene
-from compgs.tiles.ground import Ground, ground_of
+from compgs.tiles.ground import ground_of
 from compgs.tiles.sight import shares_of_picture, times_seen
 
 PLAN_NAME = "plan.json"
 SCHEMA = "compgs tiles plan 1"
-MOST_TILES = 1024  # of a grid; a million points each are a thousand million
 # A tile for each so many points or views: what a training keeps within a few gigabytes.
 POINTS_A_TILE, VIEWS_A_TILE = 250_000, 400
 # By how much a tile's training sees more than its core at each edge: this share of the core's side, but at most as far
 # as this share of the core's points lies beyond. Sides say little where a few points lie far away.
 MARGIN = 0.2
-EDGES = 0.02  # share of a core's points on each side that do not say how long the side is: outer cores have no end
 LEAST_SHARE = 0.1  # of a picture, from which on a view shows a tile
 FEWEST_VIEWS = 8  # of a tile, if so many show anything of it
 LOOKED_AT = 20_000  # points by which cuts and views are found; a share needs no more
@@ -108,37 +105,12 @@ class Plan:
         }
 
 
-def contains(core: Core, places: np.ndarray) -> np.ndarray:
-    """[P] bool: which of the places [P, 2] lie in [low, high)."""
-    inside = (places >= core.low) & (places < core.high)
-    return inside[:, 0] & inside[:, 1]
-
-
-def parse_grid(text: str) -> tuple[int, int] | None:
-    """Columns and rows of `4x2`; None of `auto`. Raises ConfigError."""
-    if text == "auto":
-        return None
-    found = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", text)
-    if found is None or int(found[1]) * int(found[2]) > MOST_TILES:
-        raise ConfigError(
-            f"grid {text}: expected auto, or columns and rows such as 4x2, at most {MOST_TILES} tiles"
-        )
-    return int(found[1]), int(found[2])
-
-
 def grid_for(scene: Scene) -> tuple[int, int]:
     """Columns and rows of tiles that are about square, one for each POINTS_A_TILE points and VIEWS_A_TILE views."""
     points, views = len(scene.points), len(scene.train_views)
-    count = min(MOST_TILES, math.ceil(max(points / POINTS_A_TILE, views / VIEWS_A_TILE, 1)))
+    count = math.ceil(max(points / POINTS_A_TILE, views / VIEWS_A_TILE, 1))
     cameras = [view.camera for view in scene.train_views]
-    width, height = _sides(ground_of(cameras, scene.points.positions).places(scene.points.positions))
-
-    def unevenness(columns: int) -> float:
-        rows = math.ceil(count / columns)
-        return abs(math.log(width / columns * rows / height)) + math.log(columns * rows / count)
-
-    columns = min(range(1, count + 1), key=unevenness)
-    return columns, math.ceil(count / columns)
+    return grid_of(count, ground_of(cameras, scene.points.positions).places(scene.points.positions))
 
 
 def plan_tiles(scene: Scene, columns: int, rows: int) -> Plan:
@@ -151,7 +123,7 @@ def plan_tiles(scene: Scene, columns: int, rows: int) -> Plan:
     ground = ground_of(cameras, positions)
     looked_at = max(LOOKED_AT, LOOKED_AT_A_TILE * columns * rows)
     sample = positions[:: max(1, len(positions) // looked_at)]
-    cores = _cores(ground.places(sample), times_seen(cameras, sample), columns, rows)
+    cores = cores_of(ground.places(sample), times_seen(cameras, sample), columns, rows)
     places = ground.places(positions)
     inside = {name: contains(core, places) for name, core in cores.items()}
     for name, points in inside.items():
@@ -179,44 +151,9 @@ def plan_tiles(scene: Scene, columns: int, rows: int) -> Plan:
     return Plan(scene.name, columns, rows, ground, tiles)
 
 
-def _cores(places: np.ndarray, weights: np.ndarray, columns: int, rows: int) -> dict[str, Core]:
-    """Return the cores by name, column by column."""
-    weights = weights if weights.any() else np.ones(len(places))
-    cores = {}
-    edges = [-math.inf, *cuts(places[:, 0], weights, columns), math.inf]
-    for column in range(columns):
-        mine = (places[:, 0] >= edges[column]) & (places[:, 0] < edges[column + 1])
-        across = [-math.inf, *cuts(places[mine, 1], weights[mine], rows), math.inf]
-        for row in range(rows):
-            low, high = (edges[column], across[row]), (edges[column + 1], across[row + 1])
-            cores[f"{column}_{row}"] = Core(low, high)
-    return cores
-
-
-def cuts(values: np.ndarray, weights: np.ndarray, parts: int) -> list[float]:
-    """Where to cut values [P] into parts of equal weight: parts - 1 numbers between two values, ascending."""
-    order = np.argsort(values, kind="stable")
-    ordered, total = values[order], np.cumsum(weights[order])
-    if len(total) == 0:
-        raise ConfigError(f"grid: there are no points to cut into {parts} parts; use fewer tiles")
-    at = np.searchsorted(total, total[-1] * np.arange(1, parts) / parts)
-    following = np.minimum(at + 1, len(ordered) - 1)
-    found = ((ordered[at] + ordered[following]) / 2).tolist()
-    if any(second <= first for first, second in itertools.pairwise(found)):
-        raise ConfigError(f"grid: {len(values)} points cannot be cut into {parts} parts; use fewer tiles")
-    return found
-
-
-def _sides(places: np.ndarray) -> tuple[float, float]:
-    """Lengths of the rectangle that holds all but a few of the places [P, 2]."""
-    low, high = np.quantile(places, [EDGES, 1 - EDGES], axis=0)
-    width, height = np.maximum(high - low, 1e-9)
-    return float(width), float(height)
-
-
 def _padded(core: Core, places: np.ndarray, inside: np.ndarray) -> Core:
     """The core with its margins; places: [P, 2] of all points, inside: [P] bool."""
-    sides, few = _sides(places[inside]), math.ceil(MARGIN * inside.sum())
+    lengths, few = sides(places[inside]), math.ceil(MARGIN * inside.sum())
     low, high = list(core.low), list(core.high)
     for axis in (0, 1):
         other = 1 - axis
@@ -225,7 +162,7 @@ def _padded(core: Core, places: np.ndarray, inside: np.ndarray) -> Core:
             if math.isfinite(edges[axis]):
                 beyond = sign * (places[beside, axis] - edges[axis])
                 nearest = np.sort(beyond[beyond >= 0])[:few]
-                margin = MARGIN * sides[axis]
+                margin = MARGIN * lengths[axis]
                 edges[axis] += sign * min(margin, float(nearest[-1]) if len(nearest) else margin)
     return Core((low[0], low[1]), (high[0], high[1]))
 
