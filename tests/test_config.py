@@ -186,6 +186,7 @@ def test_the_control_of_earlier_versions_is_one_of_the_variants() -> None:
 def test_a_run_that_left_out_a_former_rule_is_read_without_it() -> None:
     for rules, today in (
         ("all but sampled_gradients", "all"),
+        ("all but own_residuals_many, dropout", "all but dropout"),
         ("all but sampled_gradients, hidden_anchors", "all but hidden_anchors"),
         ("all but dropout, sampled_gradients", "all but dropout"),
         ("all but dropout", "all but dropout"),

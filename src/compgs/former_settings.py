@@ -50,7 +50,9 @@ def _of_steps() -> Former:
 
 FORMER = {
     "model.residuals_where_few": _became_rule(1e-3, "own_residuals_few"),
-    "model.residuals_where_many": _became_rule(1e-5, "own_residuals_many"),
+    "model.residuals_where_many": Former(
+        None, "anchors share them where views are many; --set model.residuals=true gives each its own"
+    ),
     "model.twice_coupled_where_few": _became_rule(1e-4, "twice_coupled"),
     "model.separate_where_long": _became_rule(1e-5, "separate_heads"),
     "model.sharp_where_many": _became_rule(0.002, "sharp"),
@@ -93,9 +95,9 @@ FORMER = {
     "entropy.residual_step": _of_steps(),
     "entropy.covariance_step": _of_steps(),
 }
-# Former rules, which saved time and changed nothing else: a run that left one out is what every run is now. What they
-# decided has the same name in the plan of a run.
-FORMER_RULES = ("sampled_gradients",)
+# Former rules: a run that left one out is what every run is now. What `sampled_gradients` decided has the same name in
+# the plan of a run.
+FORMER_RULES = ("sampled_gradients", "own_residuals_many")
 # The former settings of `training` that `training.phases` holds now, in its order, with their defaults.
 PHASES = {
     "head_warm_up": 0.05,
