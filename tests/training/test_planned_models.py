@@ -84,7 +84,7 @@ def test_a_long_run_at_the_top_trains_encodes_and_resumes_with_separate_networks
     passes = replace(config, training=replace(config.training, steps=45 * len(many.train_views)))
     trainer = Trainer(many, passes, torch.device("cpu"))
     trainer.train_step()
-    assert trainer.model.dimensions.heads == "separate" and trainer.model.own_residuals
+    assert trainer.model.dimensions.heads == "separate" and not trainer.model.own_residuals
     trainer.save(tmp_path / "checkpoint.safetensors")
     restored = load_checkpoint(tmp_path / "checkpoint.safetensors").model
     assert restored.dimensions.heads == "separate"
