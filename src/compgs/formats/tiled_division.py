@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from compgs.codec.content import COORDINATES, Group
 from compgs.codec.decoder import from_latents
 from compgs.codec.format import named
+from compgs.codec.integer_network import IntegerNetwork
 from compgs.codec.reader import read_latents
 from compgs.codec.reduce import divided
 from compgs.codec.writer import write_content
@@ -36,10 +38,10 @@ def divide_file(
     """
     with named(path):
         content, latents = read_latents(data)
-    if any(group.shape.sees_coordinates for group in content.groups):
+    if any(map(_depends_on_place, content.groups)):
         raise ConfigError(
-            f"{path}: its latents depend on where an anchor is in the whole scene, as those of files of some kilobytes "
-            "do, so no part of it can stand alone; send the file as it is, or train the capture in tiles (compgs tiles)"
+            f"{path}: its latents depend on where an anchor is in the whole scene, so no part of it can stand alone; "
+            "send the file as it is, or train the capture in tiles (compgs tiles)"
         )
     drawn = np.asarray(content.mask.any(axis=1))
     if not drawn.any():
@@ -61,3 +63,12 @@ def divide_file(
 
     write_tiles(folder, tiles(), ground)
     return len(cores)
+
+
+def _depends_on_place(group: Group) -> bool:
+    """Whether a group's means or scales follow the coordinates in the octree, which a part has anew. Files of this
+    program with one mean a channel have a network that takes the coordinates, with weights of zero.
+    """
+    if not group.shape.sees_coordinates or not isinstance(group.prior, IntegerNetwork):
+        return False
+    return bool(group.prior.layers[0].weight[:, :COORDINATES].any())
