@@ -150,3 +150,12 @@ def test_reductions_go_one_after_the_other(content: FileContent) -> None:
     a = with_coarser_covariances(without_coupled(content, kept), 2.0)
     b = without_coupled(with_coarser_covariances(content, 2.0), kept)
     assert write_content(a) == write_content(b)
+
+
+def test_nothing_is_left_out_where_the_rest_would_become_something_else() -> None:
+    """Latents of this file follow the coordinates in the octree; without its outer anchors that is another one."""
+    content = read_content((Path(__file__).parents[1] / "golden" / "odd.cgs").read_bytes())
+    far = np.abs(content.coordinates - np.median(content.coordinates, axis=0)).max(1)
+    inner = np.repeat(far <= np.median(far), content.mask.sum(1))
+    with pytest.raises(NotEncodable, match="depend on where an anchor is in the whole scene"):
+        without_coupled(content, inner)

@@ -7,7 +7,7 @@ import pytest
 
 from compgs.codec.content import FileContent, Role, dequantize
 from compgs.codec.reader import read_content
-from compgs.errors import ConfigError, NotACompGSFile, OutputError
+from compgs.errors import ConfigError, NotACompGSFile, NotEncodable, OutputError
 from compgs.exporting import export
 from compgs.formats.tiled import Core, read_manifest
 from compgs.formats.tiled_ground import contains, grid_of, ground_across
@@ -100,8 +100,8 @@ def test_the_ground_lies_across_the_sky_along_which_points_spread_most() -> None
 
 
 def test_latents_that_depend_on_the_place_in_the_whole_scene_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"odd\.cgs: its latents depend on where an anchor is"):
-        export(GOLDEN / "odd.cgs", tmp_path / "a.tiles")
+    with pytest.raises(NotEncodable, match=r"odd\.cgs: latents depend on where an anchor is"):
+        export(GOLDEN / "odd.cgs", tmp_path / "a.tiles", grid="2x2")
     assert not (tmp_path / "a.tiles").exists()
 
 

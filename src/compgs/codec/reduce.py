@@ -13,9 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from compgs.codec.content import (
+    COORDINATES,
     LOG_SCALES,
     FileContent,
     Group,
+    Latents,
     Role,
     StepsOf,
     code_group,
@@ -28,30 +30,29 @@ from compgs.codec.integer_network import BIAS_LIMIT, FRACTION_BITS, IntegerNetwo
 from compgs.codec.rows import symbols_of_rows
 from compgs.codec.tables import SCALES_PER_OCTAVE
 from compgs.errors import NotEncodable
-from compgs.ordering.order import canonical_order
+from compgs.ordering.order import canonical_order, octree_depth, octree_origin
 
 
 def without_coupled(content: FileContent, kept: np.ndarray) -> FileContent:
-    """The content with only the coupled primitives that are `kept`, [P] bool in the file's order, and their anchors."""
+    """The content with only the coupled primitives that are `kept`, [P] bool in the file's order, and their anchors.
+
+    Raises NotEncodable where latents depend on where an anchor is in the octree, and that is another one then.
+    """
     mask = content.mask.copy()
     mask[mask] = kept
-    latents = dequantize(content) if _sees_neighbours(content) else None
-    return _with_mask(content, mask, latents)
+    sees_neighbours = any(group.shape.sees_neighbours for group in content.groups)
+    return _with_mask(content, mask, dequantize(content) if sees_neighbours else None)
 
 
-def divided(content: FileContent, part_of: np.ndarray) -> Iterator[FileContent]:
+def divided(content: FileContent, latents: Latents, part_of: np.ndarray) -> Iterator[FileContent]:
     """The parts of a content, in the order of their numbers: each has the anchors that are given its number, but for
     those without a coupled primitive. Every part has to have one.
 
-    part_of: [N] int, of the file's anchors; what is negative goes into no part.
+    `latents`: those of the content; part_of: [N] int, of its anchors; what is negative goes into no part.
+    Raises NotEncodable as `without_coupled`.
     """
-    latents = dequantize(content) if _sees_neighbours(content) else None
     for number in np.unique(part_of[part_of >= 0]):
         yield _with_mask(content, content.mask & (part_of == number)[:, None], latents)
-
-
-def _sees_neighbours(content: FileContent) -> bool:
-    return any(group.shape.sees_neighbours for group in content.groups)
 
 
 def _with_mask(content: FileContent, mask: np.ndarray, latents: Sequence[np.ndarray] | None) -> FileContent:
@@ -74,6 +75,11 @@ def _with_mask(content: FileContent, mask: np.ndarray, latents: Sequence[np.ndar
         groups=tuple(map(narrowed, content.groups)),
         levels=None,  # the octree may be another one
     )
+    if any(map(_depends_on_place, content.groups)) and not _same_octree(content, smaller):
+        raise NotEncodable(
+            "latents depend on where an anchor is in the whole scene, so no part of it can stand alone; "
+            "keep the file, or train again"
+        )
     if latents is None:
         return smaller
     order = canonical_order(smaller.coordinates)
@@ -82,6 +88,23 @@ def _with_mask(content: FileContent, mask: np.ndarray, latents: Sequence[np.ndar
         for group, x in zip(content.groups, latents, strict=True)
     ]
     return with_latents(reordered(smaller, order), own)
+
+
+def _depends_on_place(group: Group) -> bool:
+    """Whether a group's means or scales follow the coordinates in the octree. Files of this program with one mean a
+    channel have a network that takes the coordinates, with weights of zero.
+    """
+    if not group.shape.sees_coordinates or not isinstance(group.prior, IntegerNetwork):
+        return False
+    return bool(group.prior.layers[0].weight[:, :COORDINATES].any())
+
+
+def _same_octree(one: FileContent, other: FileContent) -> bool:
+    if len(other.coordinates) == 0:
+        return True
+    origin, its = octree_origin(one.coordinates), octree_origin(other.coordinates)
+    depths = octree_depth(one.coordinates - origin), octree_depth(other.coordinates - its)
+    return bool((origin == its).all()) and depths[0] == depths[1]
 
 
 def with_latents(content: FileContent, latents: Sequence[np.ndarray]) -> FileContent:

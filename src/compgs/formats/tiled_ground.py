@@ -15,9 +15,7 @@ from compgs.errors import ConfigError
 from compgs.formats.tiled import Core, GroundAxes, Vector, ground_from_entry
 
 MOST_TILES = 1024  # of a grid; a million points each are a thousand million
-INNER = (
-    0.9  # share of the points, the nearest to the middle, that say how a scene lies: not the far background
-)
+INNER = 0.9  # share of the points, the nearest to the middle, that say how a scene lies: not the background
 EDGES = 0.02  # share of a core's points on each side that do not say how long the side is: outer cores have no end
 
 
