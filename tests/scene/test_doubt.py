@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from compgs.cli.cameras import say_cameras
 from compgs.cli.ending import say_next
 from compgs.scene import load_scene
 from compgs.scene.colmap import read_sparse_model
@@ -49,12 +50,15 @@ def test_frames_of_a_video_are_in_doubt_and_nothing_else_that_a_report_says(
 
 
 @pytest.mark.parametrize("report", ["reconstruction.json", "adjustment.json"])
-def test_after_a_training_cameras_are_worth_adjusting_unless_this_program_fitted_them(
+def test_before_and_after_a_training_cameras_are_worth_adjusting_unless_this_program_fitted_them(
     write_capture: Callable[..., Path], capsys: pytest.CaptureFixture[str], report: str
 ) -> None:
     folder = write_capture()
+    say_cameras(folder)
+    assert f"compgs adjust {folder} -o {folder}_adjusted" in capsys.readouterr().out
     say_next(folder / "scene.cgs", folder)
     assert f"next: compgs adjust {folder} -o {folder}_adjusted" in capsys.readouterr().out
     (folder / report).write_text("{}")
+    say_cameras(folder)
     say_next(folder / "scene.cgs", folder)
     assert "adjust" not in capsys.readouterr().out

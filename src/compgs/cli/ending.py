@@ -3,6 +3,7 @@
 import shlex
 from pathlib import Path
 
+from compgs.cli.cameras import adjusting_command
 from compgs.cli.console import say
 from compgs.cli.run_folder import add_facts, file_name
 from compgs.words import size
@@ -12,8 +13,6 @@ NOTABLE_MISS = 0.05  # of the size that was asked for
 
 def say_next(file: Path, capture: Path) -> None:
     """Commands that somebody who has just trained a scene of a capture may want."""
-    from compgs.scene.doubt import cameras_from_elsewhere
-
     name = shlex.quote(str(file))
     commands = {f"compgs view {name}": "look at it in the browser"}
     if file.suffix == ".cgs":
@@ -21,11 +20,8 @@ def say_next(file: Path, capture: Path) -> None:
         commands[f"compgs export {name} {page}"] = "one page to share, which opens from disk"
     else:
         commands[f"compgs info {name}"] = "what takes how many bytes"
-    if cameras_from_elsewhere(capture):
-        source, adjusted = shlex.quote(str(capture)), shlex.quote(f"{capture}_adjusted")
-        commands[f"compgs adjust {source} -o {adjusted}"] = (
-            "if it is soft: cameras that fit the photographs better"
-        )
+    if adjusting := adjusting_command(capture):
+        commands[adjusting] = "if it is soft: cameras that fit the photographs better"
     width = max(map(len, commands))
     for command, purpose in commands.items():
         say(f"next: {command:{width}}  # {purpose}")

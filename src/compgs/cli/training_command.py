@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
+from compgs.cli.cameras import say_cameras
 from compgs.cli.command import (
     NO_DEFAULT,
     ComputingCommand,
@@ -153,6 +154,8 @@ class TrainingCommand(ComputingCommand, SceneOptions):
             if leads and settings.plan is not None:
                 say_lines(settings.plan)
             if leads and settings.tile is None:
+                if not self.resume:
+                    say_cameras(Path(settings.scene.path))
                 self.check_held_out(scene, settings)
             if not leads:
                 self.train(scene, settings, folder, None, None)
@@ -194,6 +197,7 @@ class TrainingCommand(ComputingCommand, SceneOptions):
         plan = plan_in(settings)
         assert plan is not None and settings.plan is not None
         say_lines(settings.plan)
+        say_cameras(Path(settings.scene.path))
         say_expected(plan, scene, settings, self.device)
 
     @property
