@@ -34,9 +34,16 @@ ROOT = Path(__file__).parents[2]
 USUAL = Start(5000, 80, 60.0, 30.0, 0.002, 86_400, "cpu")
 STARTS = [
     replace(
-        USUAL, anchors=anchors, sightings=sightings, passes=passes, lmbda=lmbda, pixels=pixels, device=device
+        USUAL,
+        anchors=anchors,
+        findable=findable,
+        sightings=sightings,
+        passes=passes,
+        lmbda=lmbda,
+        pixels=pixels,
+        device=device,
     )
-    for anchors in (300, 5000, 500_000)
+    for anchors, findable in ((300, 0), (5000, 0), (5000, 15_000), (500_000, 300_000))
     for sightings in (5.0, 16.0, 17.0, 150.0)
     for passes in (10.0, 44.9, 45.0)
     for lmbda in LAMBDAS[::6]
@@ -145,6 +152,12 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         ({"anchors": 20_000}, "voxel_spacings", 0.7),
         ({"anchors": 20_000}, "dense_points", 8.0),
         ({"anchors": 20_000, "sightings": 16.0}, "dense_points", 0.0),
+        ({"findable": 15_000}, "dense_points", 8.0),
+        ({"findable": 15_000}, "heads", "shallow"),
+        ({"findable": 14_999}, "dense_points", 0.0),
+        ({"findable": 15_000, "sightings": 16.0}, "dense_points", 0.0),
+        ({"findable": 15_000, "points_at_hand": True}, "dense_points", 0.0),
+        ({"findable": 15_000, "points_at_hand": True}, "head_bits", 7),
         ({"anchors": 20_000, "points_at_hand": True}, "voxel_spacings", 1.5),
         ({"anchors": 20_000, "points_at_hand": True}, "coupled_primitives", 5),
         ({"anchors": 20_000, "points_at_hand": True}, "dense_points", 0.0),
@@ -159,6 +172,7 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         ({"anchors": 20_000, "points_at_hand": True}, "heads", "paired"),
         ({"lmbda": 0.001, "anchors": 3_400}, "width", 32),
         ({"lmbda": 0.001, "anchors": 3_333}, "width", 16),
+        ({"lmbda": 0.001, "anchors": 3_333, "findable": 20_000}, "width", 32),
         ({"lmbda": 0.01, "anchors": 6_000}, "width", 8),
         ({"lmbda": 0.003, "anchors": 6_000}, "reference_context", "neighbours"),
         ({"lmbda": 0.005, "anchors": 6_000}, "reference_context", "none"),
@@ -244,6 +258,8 @@ def test_the_networks_of_many_anchors_have_weights_of_more_bits() -> None:
 def test_bits_of_weights_follow_the_price_as_it_is_now() -> None:
     found = [head_bits(Config(), USUAL, 1000 * price, 1000) for price in (1e-9, 3.1e-6, 3.1e-5)]
     assert found == [7, 6, 5]
+    pruned = replace(USUAL, findable=30_000)
+    assert [head_bits(Config(), pruned, 1e-3, anchors) for anchors in (19_999, 20_000)] == [7, 12]
 
 
 def test_the_price_is_what_a_bit_of_the_networks_adds_to_the_objective() -> None:

@@ -61,7 +61,7 @@ def seconds_per_step(
     no more than a part.
     """
     end = time.monotonic() + TRIED_PART * seconds
-    longer = 1.0 + FOR_POINTS * points_foretold(scene, plan)
+    longer = 1.0 + FOR_POINTS * points_foretold(plan)
     plan = replace(plan, dense_points=0.0)
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
     told: list[tuple[TrainingStatus, float]] = []  # and when

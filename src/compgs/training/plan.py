@@ -32,7 +32,9 @@ ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 1.5
 DENSE_ONE_BYTE_LAMBDA, DENSE_SIZE_EXPONENT = 1.5, 2.4
 SIZED_ANCHORS = 1_000, 200_000  # of the beginning, between which that is taken to hold
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
-# two bits of an anchor there, which has a hundred and more. More hidden units do not pay even there.
+# two bits of an anchor there, which has a hundred and more. More hidden units do not pay even there. What photographs
+# show counts, not only what structure from motion found: few points of large photographs left a few blurs
+# (docs/results/hasty_captures.md#few-points-in-large-photographs).
 MANY_ANCHORS = 20_000
 # Views that are rendered at most, spread evenly over all, to estimate the size, and to prune: the rest of the run makes
 # up for an error.
@@ -74,6 +76,7 @@ class Start:
     poses_in_doubt: bool = False  # that they are right to a pixel
     # no points are looked for in the photographs: they show more than a tile, or are pictures of splats
     points_at_hand: bool = False
+    findable: int = 0  # points that a search in the photographs would add, about
 
     @property
     def fewness(self) -> float:
@@ -86,14 +89,20 @@ class Start:
         return self.fewness >= 0.5
 
     @property
-    def large(self) -> bool:
-        """Whether anchors are so many that the networks they share hardly count in the file."""
-        return self.anchors >= MANY_ANCHORS
+    def dense(self) -> bool:
+        """Whether points are looked for in the photographs: where many show each place, and anchors become many."""
+        many = self.anchors + self.findable >= MANY_ANCHORS
+        return many and not self.few and not self.points_at_hand
 
     @property
-    def dense(self) -> bool:
-        """Whether points are looked for in the photographs: those of a large capture, if they are many."""
-        return self.large and not self.few and not self.points_at_hand
+    def beginning(self) -> int:
+        """Anchors with which training begins, about."""
+        return self.anchors + self.findable if self.dense else self.anchors
+
+    @property
+    def large(self) -> bool:
+        """Whether anchors are so many that the networks they share hardly count in the file."""
+        return self.beginning >= MANY_ANCHORS
 
     def often(self, passes: float) -> bool:
         """Whether the run passes over its training views so often."""
@@ -101,12 +110,13 @@ class Start:
 
     def costs(self, price: float) -> bool:
         """Whether a bit of the networks, which all anchors share, has this price of lambda / anchors or more."""
-        return self.lmbda >= price * self.anchors
+        return self.lmbda >= price * self.beginning
 
     def in_words(self) -> str:
         """One line for people."""
         return (
-            f"{self.anchors:,} anchors at the given points, {self.views} training views, a point is in "
+            f"{self.anchors:,} anchors at the given points, {self.findable:,} more that photographs may show, "
+            f"{self.views} training views, a point is in "
             f"{self.sightings:g} of them, {self.passes:.1f} passes, lambda {self.lmbda:.3g}, photographs of up to "
             f"{self.pixels:,} pixels, on {self.device}"
             + (f" ({self.processes} processes)" if self.processes > 1 else "")
@@ -139,7 +149,8 @@ def _voxels(config: Config, start: Start, spacings: float) -> float:
     return spacings * max(1.0, dearer) ** (1 / 6)
 
 
-DENSE = "20,000 anchors and more, a point in 17 training views and more, no tile"  # `Start.dense` for people
+# `Start.dense` for people
+DENSE = "20,000 anchors and more with those that photographs show, a point in 17 training views and more, no tile"
 # Where two rules set the same value, the later one is asked with what the earlier one chose.
 RULES: tuple[Rule, ...] = (
     Rule(
@@ -236,7 +247,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         "sharp", "dilation", lambda c, s, pixels: min(pixels, LEAST_DILATION),
-        "a point in 17 training views and more, and lambda up to 0.002 or 20,000 anchors and more, no tile",
+        f"a point in 17 training views and more, and lambda up to 0.002; or {DENSE}",
         lambda s: not s.few and (s.dense or s.lmbda <= 0.002),
         "results/decisions.md",
     ),
@@ -345,7 +356,9 @@ class Plan:
             plan = cls(**{**fields, "start": start, "reasons": reasons})
         except (TypeError, KeyError, AttributeError) as error:
             raise ValueError(f"not the plan of a run ({error})") from error
-        numbers = (start.anchors, start.views, start.sightings, start.passes, start.lmbda, start.pixels)
+        numbers = (
+            start.anchors, start.findable, start.views, start.sightings, start.passes, start.lmbda, start.pixels
+        )  # fmt: skip
         if not all(isinstance(n, int | float) and math.isfinite(n) and n >= 0 for n in numbers):
             raise ValueError(f"plan: a start that cannot be: {start!r:.200}")
         for name, (sound, expected) in _expected(plan).items():
@@ -399,7 +412,8 @@ def grid_spacings(config: Config) -> float:
 
 def head_bits(config: Config, start: Start, lmbda: float, anchors: int) -> int:
     """Bits of a weight of the prediction networks, sign included, with lambda and the anchors as they are now."""
-    return int(decided("head_bits", config, replace(start, lmbda=lmbda, anchors=anchors)))
+    now = replace(start, lmbda=lmbda, anchors=anchors, findable=0)
+    return int(decided("head_bits", config, now))
 
 
 def lambda_for(bytes_per_anchor: float, *, dense: bool = False) -> float:

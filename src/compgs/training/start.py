@@ -19,7 +19,7 @@ from compgs.scene.views import Points, Scene
 from compgs.scene.world import local_scene, world_offset
 from compgs.stereo import dense_points, expected_points
 from compgs.trained_model import TrainedModel
-from compgs.training.plan import Plan, Start, grid_spacings, head_bits, lambda_for, plan
+from compgs.training.plan import POINTS_APART, Plan, Start, grid_spacings, head_bits, lambda_for, plan
 from compgs.training.run.distributed import world
 from compgs.training.run.seen_points import sightings
 
@@ -42,6 +42,7 @@ def start_of(
         processes=world(),
         poses_in_doubt=bool(scene.poses_in_doubt),
         points_at_hand=points_at_hand,
+        findable=round(expected_points(scene, POINTS_APART)) if cameras else 0,
     )
     if t.target_bytes is None:
         return start
@@ -120,11 +121,9 @@ def initial_model(
     return model
 
 
-def points_foretold(scene: Scene, chosen: Plan) -> float:
+def points_foretold(chosen: Plan) -> float:
     """About how many points a run looks for before its first step, for each anchor that it has without them."""
-    if chosen.dense_points <= 0:
-        return 0.0
-    return expected_points(scene, chosen.dense_points) / chosen.start.anchors
+    return chosen.start.findable / chosen.start.anchors if chosen.dense_points > 0 else 0.0
 
 
 def with_dense_points(scene: Scene, pixels: float, most: int, device: torch.device) -> Scene:
