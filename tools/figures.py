@@ -58,6 +58,7 @@ FIRST = (
     "truck_adjusted_1e-3",
     "truck_adjusted_default",
     "bonsai_rate8",
+    "bonsai_1e-2",
     "bonsai_default",
     "bonsai_1e-3",
     "bonsai",
