@@ -232,12 +232,13 @@ def test_copies_of_a_point_are_one_point(write_capture: Write) -> None:
     copies = replace(model.points, positions=np.tile(model.points.positions[:3], (50, 1)))
     write_sparse_model(sparse, model.cameras.values(), model.images, copies)
     scene = load_scene(folder)
-    assert "has 3 points in different places, too few" in scene.notes[0]
+    assert "has 3 points in different places, too few" in scene.notes[0] and scene.guessed
     assert len(np.unique(scene.points.positions, axis=0)) > 1000
 
 
 def test_a_hundred_points_are_enough(write_capture: Write) -> None:
     scene = load_scene(write_capture(points=100))
+    assert not scene.guessed
     assert len(scene.points) == 100
     assert scene.notes == ()
 

@@ -12,12 +12,13 @@ from compgs.config import Config
 from compgs.numerics.evenly import evenly
 from compgs.scene import ray_tracing
 from compgs.scene.generated import camera_path, observe, still_life
+from compgs.scene.points import fallback_points
 from compgs.scene.views import Points, Scene, View
 from compgs.stereo import dense_points, expected_points
 from compgs.stereo.fusion import Places, thinned
 from compgs.stereo.neighbours import neighbours_of, sight_of
 from compgs.training.plan import plan
-from compgs.training.start import initial_model, start_of, with_dense_points
+from compgs.training.start import initial_model, start_of, with_dense_points, with_seen_points
 
 CPU = torch.device("cpu")
 
@@ -134,6 +135,27 @@ def test_a_run_begins_with_the_dense_points(scene: Scene, found: Points) -> None
     many = initial_model(scene, config, CPU, replace(sparse, dense_points=4.0)).anchors
     # Several of the points share a voxel, which goes by the sparse ones.
     assert 2 * few < many <= few + len(found)
+
+
+def test_random_points_give_way_to_those_that_photographs_show(
+    scene: Scene, solids: ray_tracing.Solids
+) -> None:
+    cameras = [view.camera for view in scene.train_views]
+    guessed = replace(scene, points=fallback_points(cameras, 2_000), guessed=True)
+    dense = replace(plan(Config(), start_of(scene, Config(), CPU, 300)), dense_points=4.0)
+
+    def on_surfaces(scene: Scene) -> float:
+        anchors = initial_model(scene, Config(), CPU, dense).positions().numpy()
+        return float(np.mean(misses(solids, anchors, cameras) < 0.05))
+
+    assert on_surfaces(guessed) > 0.8 > 0.65 > on_surfaces(replace(guessed, guessed=False))
+
+
+def test_random_points_stay_where_photographs_show_too_few(scene: Scene) -> None:
+    nothing = np.zeros((84, 112), bool)
+    masked = tuple(replace(view, counted=nothing) for view in scene.train_views)
+    guessed = replace(scene, train_views=masked, guessed=True)
+    assert with_seen_points(guessed, 4.0, CPU) is guessed
 
 
 @pytest.mark.slow

@@ -93,7 +93,7 @@ def load_scene(
     found, decoded = load_views(
         capture.images, factor, None if cut_out else behind, progress or None, at_once=at_once
     )
-    points, of_points = _enough_points(capture, found)
+    points, of_points = _enough_points(capture, found)  # with a note, if they are random
     extent = extent_of(found, points)
     held_out, rule, of_split = (
         _held_out(capture, found, points, extent, test_every, split)
@@ -116,6 +116,7 @@ def load_scene(
         notes=(*capture.notes, *other_formats, *of_size, *of_split, *of_masks, *of_points, *unused),
         poses_in_doubt=poses_in_doubt(folder, as_given, found),
         split=rule,
+        guessed=bool(of_points),
     )
 
 

@@ -77,6 +77,7 @@ class Scene:
     notes: tuple[str, ...] = ()  # what was decided or replaced on loading, one sentence each
     poses_in_doubt: str = ""  # why poses may be off by a pixel, in words; empty: nothing says so
     split: str = ""  # how the held-out views were chosen, in words; empty: not known, or none is held out
+    guessed: bool = False  # the points are at random places where the cameras look: too few were known
 
     def __repr__(self) -> str:
         views = f"{len(self.train_views)} training views, {len(self.test_views)} held out"

@@ -150,7 +150,9 @@ def _voxels(config: Config, start: Start, spacings: float) -> float:
 
 
 # `Start.dense` for people
-DENSE = "20,000 anchors and more with those that photographs show, a point in 17 training views and more, no tile"
+DENSE = (
+    "20,000 anchors and more with those that photographs show, a point in 17 training views and more, no tile"
+)
 # Where two rules set the same value, the later one is asked with what the earlier one chose.
 RULES: tuple[Rule, ...] = (
     Rule(

@@ -13,7 +13,7 @@ from compgs.errors import ConfigError
 from compgs.numerics.evenly import evenly
 from compgs.progress import shown_count
 from compgs.render.settings import as_angle
-from compgs.scene.points import colors_at, median_spacing, neighbour_distance, voxel_grid
+from compgs.scene.points import MIN_POINTS, colors_at, median_spacing, neighbour_distance, voxel_grid
 from compgs.scene.viewpoints import choose_viewpoints, up_direction
 from compgs.scene.views import Points, Scene
 from compgs.scene.world import local_scene, world_offset
@@ -90,6 +90,9 @@ def initial_model(
         m = replace(m, voxel_spacings=chosen.voxel_spacings)
         coordinates, voxel_size = anchor_grid(scene, m)
     if chosen.dense_points > 0:
+        if scene.guessed:
+            scene = with_seen_points(scene, chosen.dense_points, device)
+            coordinates, voxel_size = anchor_grid(scene, m)
         room = m.max_anchors - len(coordinates)
         scene = with_dense_points(scene, chosen.dense_points, room, device)
         coordinates, _ = anchor_grid(scene, replace(m, voxel_size=voxel_size))
@@ -124,6 +127,15 @@ def initial_model(
 def points_foretold(chosen: Plan) -> float:
     """About how many points a run looks for before its first step, for each anchor that it has without them."""
     return chosen.start.findable / chosen.start.anchors if chosen.dense_points > 0 else 0.0
+
+
+def with_seen_points(scene: Scene, pixels: float, device: torch.device) -> Scene:
+    """A scene with points every so many pixels of its photographs in place of random ones, which say little of where to
+    look. A second search, from the points of this one, finds more. The scene itself where too little was found.
+    """
+    with shown_count(None, "looking for points, photographs") as progress:
+        found = dense_points(scene, pixels, device, progress)
+    return replace(scene, points=found, guessed=False) if len(found) >= MIN_POINTS else scene
 
 
 def with_dense_points(scene: Scene, pixels: float, most: int, device: torch.device) -> Scene:
