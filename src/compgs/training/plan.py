@@ -24,12 +24,11 @@ from compgs.render.settings import LEAST_DILATION
 # lambda for which the settings of growth are given, and the range in which it follows lambda: below 1e-6 more anchors
 # took half as many bytes again and brought nothing (docs/results/decisions.md)
 USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
-# A file of b bytes for each anchor of the beginning comes of a lambda of about 0.04 / b^1.5: fitted to the default
+# A file of b bytes for each anchor at the given points comes of a lambda of about 0.04 / b^1.5: fitted to the default
 # preset's curves of docs/results (plush and brighton, 1 500 and 5 000 steps, lambda 0.0001 to 0.1). Sizes are met
 # within a factor of 2 (one standard deviation), at worst 3.5. Where points are looked for in the photographs, it is
-# about 1.5 / b^2.4: fitted to Truck and Bonsai (lambda 4e-4 to 0.002), which are met within 1.7.
-ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 1.5
-DENSE_ONE_BYTE_LAMBDA, DENSE_SIZE_EXPONENT = 1.5, 2.4
+# about 0.14 / b^1.5: Truck, Bonsai, plush and the demo (lambda 5e-4 to 0.01) are met within 2.
+ONE_BYTE_LAMBDA, DENSE_ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 0.14, 1.5
 SIZED_ANCHORS = 1_000, 200_000  # of the beginning, between which that is taken to hold
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
 # two bits of an anchor there, which has a hundred and more. More hidden units do not pay even there. What photographs
@@ -85,14 +84,16 @@ class Start:
 
     @property
     def few(self) -> bool:
-        """Whether the training views that show a point are rather few than many: up to 16."""
-        return self.fewness >= 0.5
+        """Whether the training views that show a point are rather few than many: up to 16, where no points are looked
+        for in the photographs.
+        """
+        return self.fewness >= 0.5 and not self.dense
 
     @property
     def dense(self) -> bool:
-        """Whether points are looked for in the photographs: where many show each place, and anchors become many."""
+        """Whether points are looked for in the photographs: where some show each place, and anchors become many."""
         many = self.anchors + self.findable >= MANY_ANCHORS
-        return many and not self.few and not self.points_at_hand
+        return many and self.fewness < 1.0 and not self.points_at_hand
 
     @property
     def beginning(self) -> int:
@@ -149,10 +150,11 @@ def _voxels(config: Config, start: Start, spacings: float) -> float:
     return spacings * max(1.0, dearer) ** (1 / 6)
 
 
-# `Start.dense` for people
+# `Start.dense` and `Start.few` for people
 DENSE = (
-    "20,000 anchors and more with those that photographs show, a point in 17 training views and more, no tile"
+    "20,000 anchors and more with those that photographs show, a point in 12 training views and more, no tile"
 )
+FEW = "a point in 16 training views and fewer, no points looked for"
 # Where two rules set the same value, the later one is asked with what the earlier one chose.
 RULES: tuple[Rule, ...] = (
     Rule(
@@ -181,13 +183,13 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         "twice_coupled", "coupled_primitives", lambda c, s, k: min(2 * k, MOST_COUPLED),
-        "a point in 16 training views and fewer, lambda up to 1e-4",
+        f"{FEW}, lambda up to 1e-4",
         lambda s: s.few and s.lmbda <= 1e-4,
         "results/decisions.md",
     ),
     Rule(
         "own_residuals_few", "residuals", lambda c, s, own: True,
-        "a point in 16 training views and fewer, lambda up to 0.001",
+        f"{FEW}, lambda up to 0.001",
         lambda s: s.few and s.lmbda <= 1e-3,
         "results/decisions.md",
     ),
@@ -422,13 +424,8 @@ def lambda_for(bytes_per_anchor: float, *, dense: bool = False) -> float:
     """lambda that a file of so many bytes for each anchor of the beginning comes of, about; `dense`: points are looked
     for in the photographs. It falls as bytes rise, so that whoever asks for a larger file never gets a smaller model.
     """
-    one_byte, exponent = _size_line(dense)
-    return float(one_byte * bytes_per_anchor**-exponent)
-
-
-def _size_line(dense: bool) -> tuple[float, float]:
-    """lambda of a file of one byte for each anchor, and the exponent by which it falls with more."""
-    return (DENSE_ONE_BYTE_LAMBDA, DENSE_SIZE_EXPONENT) if dense else (ONE_BYTE_LAMBDA, SIZE_EXPONENT)
+    one_byte = DENSE_ONE_BYTE_LAMBDA if dense else ONE_BYTE_LAMBDA
+    return float(one_byte * bytes_per_anchor**-SIZE_EXPONENT)
 
 
 def expected_bytes(start: Start) -> float | None:
@@ -436,8 +433,8 @@ def expected_bytes(start: Start) -> float | None:
     fewest, most = SIZED_ANCHORS
     if start.lmbda <= 0 or not fewest <= start.anchors <= most:
         return None
-    one_byte, exponent = _size_line(start.dense)
-    return float(start.anchors * (one_byte / start.lmbda) ** (1 / exponent))
+    one_byte = lambda_for(1.0, dense=start.dense)
+    return float(start.anchors * (one_byte / start.lmbda) ** (1 / SIZE_EXPONENT))
 
 
 def active_rules(config: Config) -> tuple[Rule, ...]:
