@@ -27,8 +27,8 @@ USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 # A file of b bytes for each anchor at the given points comes of a lambda of about 0.04 / b^1.5: fitted to the default
 # preset's curves of docs/results (plush and brighton, 1 500 and 5 000 steps, lambda 0.0001 to 0.1). Sizes are met
 # within a factor of 2 (one standard deviation), at worst 3.5. Where points are looked for in the photographs, it is
-# about 0.14 / b^1.5: Truck, Bonsai, plush and the demo (lambda 5e-4 to 0.01) are met within 2.
-ONE_BYTE_LAMBDA, DENSE_ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 0.14, 1.5
+# about 0.1 / b^1.5: Truck, Bonsai, plush and the demo (lambda 0.001 to 0.01) are met within 1.7.
+ONE_BYTE_LAMBDA, DENSE_ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 0.1, 1.5
 SIZED_ANCHORS = 1_000, 200_000  # of the beginning, between which that is taken to hold
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
 # two bits of an anchor there, which has a hundred and more. More hidden units do not pay even there. What photographs
