@@ -59,6 +59,7 @@ FIRST = (
     "truck_adjusted_default",
     "bonsai_rate8",
     "bonsai_1e-2",
+    "bonsai_4e-3",
     "bonsai_default",
     "bonsai_1e-3",
     "bonsai",

@@ -132,6 +132,7 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         "bonsai_default",
         "bonsai_rate8",
         "bonsai_1e-2",
+        "bonsai_4e-3",
     ):
         run = json.loads((ROOT / f"docs/results/records/{record}.json").read_text(encoding="utf-8"))
         expected = expected_bytes(Start(**run["plan"]["start"]))
