@@ -216,12 +216,13 @@ def test_a_step_takes_longer_in_a_run_that_looks_for_points(
         progress(SimpleNamespace(step=1, seconds_per_step=1.0))
 
     monkeypatch.setattr(pace, "train", train)
-    dense = plan(Config(), Start(50_000, 100, 20.0, 30.0, 0.002, 86_400, "cpu"))
+    dense = plan(Config(), Start(50_000, 100, 20.0, 30.0, 0.002, 86_400, "cpu", findable=100_000))
     assert dense.dense_points > 0
-    monkeypatch.setattr(pace, "points_foretold", lambda plan: 2.0)  # for each anchor
     took = pace.seconds_per_step(Views((0,)), Config(), "cpu", dense)
     assert took == pytest.approx(1.0 + 2.0 * pace.FOR_POINTS)
     assert asked == [replace(dense, dense_points=0.0)]  # none are looked for in a trial
+    sparse = replace(dense, dense_points=0.0)
+    assert pace.seconds_per_step(Views((0,)), Config(), "cpu", sparse) == pytest.approx(1.0)
 
 
 def test_a_time_is_kept_and_its_steps_are_written_down(

@@ -13,7 +13,6 @@ from compgs.methods import train
 from compgs.scene.views import Scene
 from compgs.training import Plan, TrainingStatus, plan_for
 from compgs.training.run.run import chosen_device
-from compgs.training.start import points_foretold
 
 TRIED = 60  # steps; fewer where these alone would take much of the time
 LEAST_TRIED = 10  # steps
@@ -61,7 +60,8 @@ def seconds_per_step(
     no more than a part.
     """
     end = time.monotonic() + TRIED_PART * seconds
-    longer = 1.0 + FOR_POINTS * points_foretold(plan)
+    found = plan.start.findable if plan.dense_points > 0 else 0
+    longer = 1.0 + FOR_POINTS * found / plan.start.anchors
     plan = replace(plan, dense_points=0.0)
     views = scene.train_views[:: max(1, len(scene.train_views) // TRIED_VIEWS)]
     told: list[tuple[TrainingStatus, float]] = []  # and when

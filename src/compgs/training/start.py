@@ -124,17 +124,11 @@ def initial_model(
     return model
 
 
-def points_foretold(chosen: Plan) -> float:
-    """About how many points a run looks for before its first step, for each anchor that it has without them."""
-    return chosen.start.findable / chosen.start.anchors if chosen.dense_points > 0 else 0.0
-
-
 def with_seen_points(scene: Scene, pixels: float, device: torch.device) -> Scene:
     """A scene with points every so many pixels of its photographs in place of random ones, which say little of where to
     look. A second search, from the points of this one, finds more. The scene itself where too little was found.
     """
-    with shown_count(None, "looking for points, photographs") as progress:
-        found = dense_points(scene, pixels, device, progress)
+    found = _looked_for(scene, pixels, device)
     return replace(scene, points=found, guessed=False) if len(found) >= MIN_POINTS else scene
 
 
@@ -142,12 +136,16 @@ def with_dense_points(scene: Scene, pixels: float, most: int, device: torch.devi
     """A scene with points every so many pixels of its photographs, also where structure from motion found none; so many
     more at most.
     """
-    with shown_count(None, "looking for points, photographs") as progress:
-        found = dense_points(scene, pixels, device, progress)
+    found = _looked_for(scene, pixels, device)
     kept = evenly(len(found), most)
     known = scene.points
     positions = np.concatenate([known.positions, found.positions[kept].astype(known.positions.dtype)])
     return replace(scene, points=Points(positions, np.concatenate([known.colors, found.colors[kept]])))
+
+
+def _looked_for(scene: Scene, pixels: float, device: torch.device) -> Points:
+    with shown_count(None, "looking for points, photographs") as progress:
+        return dense_points(scene, pixels, device, progress)
 
 
 def angular_dilation(pixels: float, cameras: Sequence[Camera]) -> float:
