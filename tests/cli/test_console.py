@@ -1,5 +1,7 @@
 """What people read."""
 
+import io
+import sys
 from dataclasses import dataclass
 
 import pytest
@@ -20,6 +22,30 @@ def test_beginnings_of_a_file_are_shown_with_what_they_hold(capsys: pytest.Captu
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == ["3", "59", "4,118"]
     assert lines[2].split() == ["8", "12,800", "84,019"]
+
+
+class InterruptedAfterWriting(io.StringIO):
+    """A standard output that takes its first line, and then a person presses Ctrl-C before the write returns."""
+
+    interrupted = False
+
+    def write(self, text: str) -> int:
+        count = super().write(text)
+        if text.endswith("\n") and not self.interrupted:
+            self.interrupted = True
+            raise KeyboardInterrupt
+        return count
+
+
+def test_an_announced_line_that_an_interrupt_meets_is_not_written_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out = InterruptedAfterWriting()
+    monkeypatch.setattr(sys, "stdout", out)
+    with pytest.raises(KeyboardInterrupt):
+        console.announce("tiny.cgs: an address")
+    console.say("ended")
+    assert out.getvalue() == "tiny.cgs: an address\nended\n"
 
 
 @dataclass(frozen=True)

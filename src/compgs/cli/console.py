@@ -53,6 +53,15 @@ def say(message: str) -> None:
     console.print(escape(message))
 
 
+def announce(message: str) -> None:
+    """One line that whoever started the command waits for, and may answer with an interrupt at once.
+
+    It goes past rich: an interrupt that meets rich between writing and forgetting a line has it written twice.
+    """
+    if not console.quiet:
+        print(message, file=console.file, flush=True)
+
+
 def warn(message: str) -> None:
     """One line about what is probably not as somebody meant it, markup taken literally."""
     errors.print(f"[bold yellow]warning:[/] {escape(message)}")

@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from compgs.cli.command import Command
-from compgs.cli.console import say
+from compgs.cli.console import announce, say
 from compgs.cli.usage import UsageError, check_range
 
 MAX_PORT = 65535
@@ -51,6 +51,6 @@ class Serve(Command):
             ) from error
         count = len(scene_files(self.folder.resolve()))
         with server, contextlib.suppress(KeyboardInterrupt):  # whoever reads the address may end it at once
-            say(f"{count} {'file' if count == 1 else 'files'}: http://{self.host}:{server.server_port}/")
+            announce(f"{count} {'file' if count == 1 else 'files'}: http://{self.host}:{server.server_port}/")
             server.serve_forever()
         say("ended")

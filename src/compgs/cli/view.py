@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import FlagCreatePairsOff, arg
 
 from compgs.cli.command import NO_DEFAULT, DecodingCommand, MemoryOption, SceneFileOrRunArgument
-from compgs.cli.console import say
+from compgs.cli.console import announce, say
 from compgs.cli.levels import LevelOption
 from compgs.cli.run_folder import file_and_run
 from compgs.cli.usage import UsageError, check_range
@@ -74,7 +74,7 @@ class View(DecodingCommand, SceneFileOrRunArgument, LevelOption, MemoryOption):
             listening(shown, OwnThread(self.prepare), self.host, self.port) as viewer,
             contextlib.suppress(KeyboardInterrupt),  # whoever reads the address may end it at once
         ):
-            say(f"{file}: {viewer.address}")
+            announce(f"{file}: {viewer.address}")
             if self.open:
                 webbrowser.open(viewer.address)
             threading.Event().wait()
