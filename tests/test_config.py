@@ -189,6 +189,7 @@ def test_a_run_that_left_out_a_former_rule_is_read_without_it() -> None:
         ("all but own_residuals_many, dropout", "all but dropout"),
         ("all but sampled_gradients, hidden_anchors", "all but hidden_anchors"),
         ("all but dropout, sampled_gradients", "all but dropout"),
+        ("all but separate_heads", "all"),
         ("all but dropout", "all but dropout"),
         ("none", "none"),
     ):

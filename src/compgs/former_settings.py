@@ -54,7 +54,9 @@ FORMER = {
         None, "anchors share them where views are many; --set model.residuals=true gives each its own"
     ),
     "model.twice_coupled_where_few": _became_rule(1e-4, "twice_coupled"),
-    "model.separate_where_long": _became_rule(1e-5, "separate_heads"),
+    "model.separate_where_long": Former(
+        None, "two networks predict at every lambda; --set model.heads=separate gives four"
+    ),
     "model.sharp_where_many": _became_rule(0.002, "sharp"),
     "model.networks_by_price": _became_rule(
         True, "width_16", "width_8", "no_context", "one_bit_less", "two_bits_less"
@@ -97,7 +99,7 @@ FORMER = {
 }
 # Former rules: a run that left one out is what every run is now. What `sampled_gradients` decided has the same name in
 # the plan of a run.
-FORMER_RULES = ("sampled_gradients", "own_residuals_many")
+FORMER_RULES = ("sampled_gradients", "own_residuals_many", "separate_heads")
 # The former settings of `training` that `training.phases` holds now, in its order, with their defaults.
 PHASES = {
     "head_warm_up": 0.05,

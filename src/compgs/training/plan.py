@@ -193,14 +193,6 @@ RULES: tuple[Rule, ...] = (
         lambda s: s.few and s.lmbda <= 1e-3,
         "results/decisions.md",
     ),
-    # Runs of 49 passes gain by it, on plush (docs/results/leave_one_out.md). On Truck separate heads, own residual
-    # embeddings and K = 10 are together 0.45 dB worse in a third more bytes (docs/results/truck.md).
-    Rule(
-        "separate_heads", "heads", lambda c, s, heads: "separate",
-        "45 passes and more, fewer than 20,000 anchors, lambda up to 1e-5",
-        lambda s: not s.large and s.often(45) and s.lmbda <= 1e-5,
-        "results/decisions.md",
-    ),
     # Left to large captures: of the small ones some gain more by it, and the demo's computed scene loses
     # (docs/results/tried.md).
     Rule(
