@@ -91,8 +91,16 @@ def test_a_plan_alone_trains_nothing(
     assert main(["train", str(scene), "--plan", "--device", "cpu", "--set", "model.max_anchors=60"]) == 0
     said = capsys.readouterr().out
     assert "training views, a point is in" in said and "residuals" in said
-    assert "time: about" in said and "size not known" in said
+    assert "time: about" in said and "size not known" in said and "--time 1h" not in said
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_plan_of_hours_says_how_to_have_a_shorter_run(
+    scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("compgs.compressing.pace.seconds_per_step", lambda *_: 0.5)
+    assert main(["train", str(scene), "--plan", "--device", "cpu", "--steps", "20000"]) == 0
+    assert "--time 1h takes as many as fit into an hour" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("options", [["--method", "3dgs"], ["--resume", "-o", "nowhere"]])

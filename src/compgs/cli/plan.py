@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from compgs.training import Plan
 
 PLANNED = "compgs"  # the method whose trainings have a plan
+LONG = 7200  # seconds from which on a run is told how to be shorter
 
 
 def planned(settings: RunSettings, scene: "Scene", device: str | None, tiles: int = 1) -> RunSettings:
@@ -79,8 +80,10 @@ def say_expected(plan: "Plan", scene: "Scene", settings: RunSettings, device: st
         say("time: not known for a capture in tiles")
     else:
         pace = seconds_per_step(scene, settings.config, device, plan)
+        shorter = "; --time 1h takes as many as fit into an hour" if pace * steps > LONG else ""
         say(
-            f"time: about {duration(pace * steps)}, {steps:,} steps at the pace of the first ones, {pace:.3f} s each"
+            f"time: about {duration(pace * steps)}, {steps:,} steps at the pace of the first ones, "
+            f"{pace:.3f} s each{shorter}"
         )
     bytes_ = expected_bytes(plan.start)
     if asked is not None:
