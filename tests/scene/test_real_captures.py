@@ -1,11 +1,13 @@
 """Real captures, where they are at hand: poses, points and photographs agree with each other."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from compgs.scene import Scene, load_scene
+from compgs.scene.agreement import LEAST_AGREEMENT, color_agreement
 from compgs.scene.colmap import read_sparse_model
 from compgs.scene.points import voxel_grid
 
@@ -69,3 +71,15 @@ def test_points_have_the_colors_of_the_pixels_they_project_to() -> None:
     assert half.train_views[0].image.shape == (179, 240, 3)
     assert point_color_error(scene) < 25
     assert point_color_error(half) < 25
+
+
+@pytest.mark.parametrize("name", ["plush_480", "brighton_480"])
+def test_a_real_capture_is_told_from_itself_with_exchanged_photographs(name: str) -> None:
+    scene = load_scene(capture(name), downscale=2)
+    views = scene.train_views
+    others = tuple(
+        replace(view, pixels=other.image) for view, other in zip(views, views[5:] + views[:5], strict=True)
+    )
+    own, exchanged = color_agreement(scene), color_agreement(replace(scene, train_views=others))
+    assert own is not None and exchanged is not None
+    assert exchanged < LEAST_AGREEMENT < own

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
-from compgs.cli.cameras import say_cameras
+from compgs.cli.cameras import say_cameras, warn_of_other_cameras
 from compgs.cli.command import (
     NO_DEFAULT,
     ComputingCommand,
@@ -150,6 +150,8 @@ class TrainingCommand(ComputingCommand, SceneOptions):
             if self.resume:
                 say(f"{folder} {'goes on' if self.continues(folder) else BEGINS_AGAIN}: {in_words(settings)}")
             scene, settings = self.read(settings)
+            if leads and settings.tile is None and not self.resume:
+                warn_of_other_cameras(scene)
             settings = planned(self.timed(settings, scene), scene, self.device)
             if leads and settings.plan is not None:
                 say_lines(settings.plan)
@@ -193,6 +195,7 @@ class TrainingCommand(ComputingCommand, SceneOptions):
             )
         self.prepare_training("train")
         scene, settings = self.read(settings)
+        warn_of_other_cameras(scene)
         settings = planned(self.timed(settings, scene), scene, self.device)
         plan = plan_in(settings)
         assert plan is not None and settings.plan is not None
