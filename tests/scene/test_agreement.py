@@ -8,7 +8,7 @@ import pytest
 
 from compgs.cameras import Camera
 from compgs.cli.cameras import warn_of_other_cameras
-from compgs.scene import Points, Scene, View, load_scene
+from compgs.scene import Points, Scene, View
 from compgs.scene.agreement import LEAST_AGREEMENT, color_agreement
 
 SIDE, FOCAL, DISTANCE = 64, 80.0, 5.0

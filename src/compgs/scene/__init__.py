@@ -12,6 +12,7 @@
 | `names`, `text_files` | names and texts as other programs write them |
 | `hold_out`, `split_names`, `angles` | which views are held out, and how far they are from the others |
 | `doubt` | whether poses may be off by a pixel |
+| `agreement` | whether the cameras took the photographs that they are said to have taken |
 | `sight`, `viewpoints` | what cameras see, and the few that stand for all |
 | `no_poses`, `unused` | what to say of folders without poses, and of files that are not used |
 | `generated`, `ray_tracing` | a generated scene |

@@ -44,5 +44,5 @@ def color_agreement(scene: Scene) -> float | None:
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> int:
-    """Of colors [N, 3], how many are alike."""
+    """Count the pairs of colors [N, 3] that are alike."""
     return int((np.abs(one - other).mean(1) < ALIKE).sum())
