@@ -19,7 +19,7 @@ class Machine:
     step: int = 0
     passed: list[int] = field(default_factory=list)
 
-    def pass_over(self, steps: int) -> None:
+    def skip_steps(self, steps: int) -> None:
         self.passed.extend(range(self.step, self.step + steps))
         self.step += steps
 

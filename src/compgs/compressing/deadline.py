@@ -22,7 +22,7 @@ class PassesOver(Protocol):
 
     step: int
 
-    def pass_over(self, steps: int) -> None: ...
+    def skip_steps(self, steps: int) -> None: ...
 
 
 class Deadline:
@@ -55,5 +55,5 @@ class Deadline:
         self._owed += self._behind
         steps = min(math.floor(self._owed), self.steps - trainer.step - 1)
         if steps > 0:
-            trainer.pass_over(steps)
+            trainer.skip_steps(steps)
             self._owed -= steps

@@ -1,5 +1,6 @@
-"""What a run decides for itself, before its first step. This is the one place in training that compares lambda, bytes,
-views or passes with a number.
+"""What a run decides for itself, before its first step: the one place where lambda, bytes, views or passes choose
+between two ways of training. What a way then counts in its own units stays with it: the schedule of growth in
+`structure/control.py`, the price of a bit in `structure/pruning.py`, how fast a size is followed in `rate`.
 
     settings ─┐
               ├─► RULES, one after the other ─► Plan ─► model, step, events, file
@@ -29,7 +30,7 @@ USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 # within a factor of 2 (one standard deviation), at worst 3.5. Where points are looked for in the photographs, it is
 # about 0.1 / b^1.5: Truck, Bonsai, plush and the demo (lambda 0.001 to 0.01) are met within 1.7.
 ONE_BYTE_LAMBDA, DENSE_ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 0.1, 1.5
-SIZED_ANCHORS = 1_000, 200_000  # of the beginning, between which that is taken to hold
+SIZED_ANCHORS = 1_000, 200_000  # at the given points, between which that is taken to hold
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
 # two bits of an anchor there, which has a hundred and more. More hidden units do not pay even there. What photographs
 # show counts, not only what structure from motion found: few points of large photographs left a few blurs
@@ -150,16 +151,17 @@ def _voxels(config: Config, start: Start, spacings: float) -> float:
     return spacings * max(1.0, dearer) ** (1 / 6)
 
 
-# `Start.dense` and `Start.few` for people
-DENSE = (
-    "20,000 anchors and more with those that photographs show, a point in 12 training views and more, no tile"
-)
-FEW = "a point in 16 training views and fewer, no points looked for"
+# `Start.large`, `Start.dense`, `Start.few` and `Start.fewness` for people
+LARGE = f"{MANY_ANCHORS:,} anchors and more"
+DENSE = f"{LARGE} with those that photographs show, a point in {FEW_SIGHTINGS + 1} training views and more, no tile"
+RATHER_FEW = 3 * FEW_SIGHTINGS // 2  # training views that show a point: half of `fewness`
+FEW = f"a point in {RATHER_FEW} training views and fewer, no points looked for"
+FEWER = f"a point in fewer than {2 * FEW_SIGHTINGS} training views"
 # Where two rules set the same value, the later one is asked with what the earlier one chose.
 RULES: tuple[Rule, ...] = (
     Rule(
         "coarser_grid", "voxel_spacings", _voxels,
-        "lambda above 0.002: voxels grow with its sixth root",
+        f"lambda above {USUAL_LAMBDA:g}: voxels grow with its sixth root",
         lambda s: s.lmbda > USUAL_LAMBDA,
         "results/decisions.md",
     ),
@@ -201,7 +203,9 @@ RULES: tuple[Rule, ...] = (
         lambda s: s.dense,
         "results/truck.md",
     ),
-    # Plush is better with 32 at a price of 1.6e-7, level at 3.1e-7, and better with 16 at 6.2e-7.
+    # A price is lambda / anchors: what a bit costs that all anchors share. Plush is better with 32 units at 1.6e-7,
+    # level at 3.1e-7, and better with 16 at 6.2e-7. The other prices were set where plush and fox gained: files at
+    # lambda 0.01, 0.03 and 0.1 became 16, 16 to 25 and 28 to 47 % smaller (docs/results/decisions.md).
     Rule(
         "width_16", "width", lambda c, s, width: min(width, 16),
         "lambda / anchors of 3e-7 and more",
@@ -224,7 +228,7 @@ RULES: tuple[Rule, ...] = (
     # On Truck weights of 7 bits lose 0.08 dB at -r 2, by which the curve there rises with a fifth more bytes.
     Rule(
         "exact_heads", "head_bits", lambda c, s, bits: max(bits, 12),
-        "20,000 anchors and more",
+        LARGE,
         lambda s: s.large,
         "results/truck.md",
     ),
@@ -243,32 +247,32 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         "sharp", "dilation", lambda c, s, pixels: min(pixels, LEAST_DILATION),
-        f"a point in 17 training views and more, and lambda up to 0.002; or {DENSE}",
-        lambda s: not s.few and (s.dense or s.lmbda <= 0.002),
+        f"a point in {RATHER_FEW + 1} training views and more, and lambda up to {USUAL_LAMBDA:g}; or {DENSE}",
+        lambda s: not s.few and (s.dense or s.lmbda <= USUAL_LAMBDA),
         "results/decisions.md",
     ),
     # Followed in a run, as lambda changes (`growth_factor`).
     Rule(
         "growth", "growth_threshold", lambda c, s, threshold: threshold * growth_factor(c, s.lmbda),
-        "always: it goes with the cube root of lambda / 0.002",
+        f"always: it goes with the cube root of lambda / {USUAL_LAMBDA:g}",
         lambda s: True,
         "results/decisions.md",
     ),
     Rule(
         "dropout", "dropout", lambda c, s, share: FEW_VIEWS_DROPOUT * s.fewness,
-        "a point in fewer than 22 training views: 0.2 where 11 or fewer",
+        f"{FEWER}: {FEW_VIEWS_DROPOUT:g} where {FEW_SIGHTINGS} or fewer",
         lambda s: s.fewness > 0,
         "results/decisions.md",
     ),
     Rule(
         "bit_discount", "bit_discount", lambda c, s, share: FEW_VIEWS_DISCOUNT * s.fewness,
-        "a point in fewer than 22 training views: 0.5 where 11 or fewer",
+        f"{FEWER}: {FEW_VIEWS_DISCOUNT:g} where {FEW_SIGHTINGS} or fewer",
         lambda s: s.fewness > 0,
         "results/decisions.md",
     ),
     Rule(
         "coarse_photographs", "coarse_until", lambda c, s, share: COARSE_UNTIL,
-        "photographs of 160,000 pixels and more: until 0.4 of the run",
+        f"photographs of {COARSE_PIXELS:,} pixels and more: until {COARSE_UNTIL:g} of the run",
         lambda s: s.pixels >= COARSE_PIXELS,
         "results/decisions.md",
     ),
@@ -379,42 +383,43 @@ class Plan:
 
 def plan(config: Config, start: Start) -> Plan:
     """The plan of a run. Raises ConfigError for `training.rules` that name no rule."""
-    values, reasons = _by_settings(config, start), {}
+    # The grid comes before the anchors, and goes by the setting, whatever size is asked for.
+    of_grid = replace(start, lmbda=config.training.lmbda)
+    found = {
+        name: decided(name, config, of_grid if name == "voxel_spacings" else start)
+        for name in _by_settings(config, start)
+    }
+    values = {name: value for name, (value, _) in found.items()}
+    return Plan(**values, start=start, reasons={name: why for name, (_, why) in found.items() if why})
+
+
+def decided(name: str, config: Config, start: Start) -> tuple[Any, str]:
+    """One value of the plan, and which rule has set it and when, in words; empty where it is the settings' own."""
+    value, reason = _by_settings(config, start)[name], ""
     for rule in active_rules(config):
-        # The grid comes before the anchors, and goes by the setting, whatever size is asked for.
-        known = replace(start, lmbda=config.training.lmbda) if rule.sets == "voxel_spacings" else start
-        if not rule.holds(known):
+        if rule.sets != name or not rule.holds(start):
             continue
-        value = rule.to(config, known, values[rule.sets])
-        if value != values[rule.sets]:
-            values[rule.sets], reasons[rule.sets] = value, f"{rule.name}: {rule.when}"
-    return Plan(**values, start=start, reasons=reasons)
-
-
-def decided(name: str, config: Config, start: Start) -> Any:
-    """One value of the plan."""
-    value = _by_settings(config, start)[name]
-    for rule in active_rules(config):
-        if rule.sets == name and rule.holds(start):
-            value = rule.to(config, start, value)
-    return value
+        chosen = rule.to(config, start, value)
+        if chosen != value:
+            value, reason = chosen, f"{rule.name}: {rule.when}"
+    return value, reason
 
 
 def grid_spacings(config: Config) -> float:
     """Median distances of the points to a voxel, as far as they are known before there are anchors."""
     start = Start(0, 1, 1.0, 1.0, config.training.lmbda, 0, "cpu")
-    return float(decided("voxel_spacings", config, start))
+    return float(decided("voxel_spacings", config, start)[0])
 
 
 def head_bits(config: Config, start: Start, lmbda: float, anchors: int) -> int:
     """Bits of a weight of the prediction networks, sign included, with lambda and the anchors as they are now."""
     now = replace(start, lmbda=lmbda, anchors=anchors, findable=0)
-    return int(decided("head_bits", config, now))
+    return int(decided("head_bits", config, now)[0])
 
 
 def lambda_for(bytes_per_anchor: float, *, dense: bool = False) -> float:
-    """lambda that a file of so many bytes for each anchor of the beginning comes of, about; `dense`: points are looked
-    for in the photographs. It falls as bytes rise, so that whoever asks for a larger file never gets a smaller model.
+    """lambda that a file of so many bytes for each anchor at the given points comes of, about; `dense`: points are
+    looked for in the photographs. It falls as bytes rise: whoever asks for a larger file never gets a smaller model.
     """
     one_byte = DENSE_ONE_BYTE_LAMBDA if dense else ONE_BYTE_LAMBDA
     return float(one_byte * bytes_per_anchor**-SIZE_EXPONENT)

@@ -142,7 +142,7 @@ class Trainer(SceneTrainer):
         self.step += 1
         self.rate = self.structure.follow(self.step, self.rate, stored=self.now.stored)
 
-    def pass_over(self, steps: int) -> None:
+    def skip_steps(self, steps: int) -> None:
         """Go on by so many steps without learning in them; what is due after each is done."""
         for _ in range(steps):
             self.finish_step()

@@ -286,9 +286,7 @@ class SplatTrainer(SceneTrainer):
         """Raises CheckpointError if there is no checkpoint, or the run was another scene's or had other settings."""
         saved = checkpoint_of(path, method, config, scene, device)
         with restoring(path):
-            x, y, z = finite(
-                saved.state.get("world_offset", [0.0] * 3), 3, "world_offset"
-            )  # older ones have none
+            x, y, z = finite(saved.state["world_offset"], 3, "world_offset")
             start = SplatModel(checked_splats(saved.model).arrays((x, y, z)), scene.background)
         trainer = cls(scene, config, device, start, hooks, phase=phase, method=method)
         trainer.go_on(path, saved)

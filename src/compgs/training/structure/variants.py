@@ -16,8 +16,8 @@ class Variant:
     every_passes: float | None = None
     # Passes before statistics are gathered, if the first control leaves the time.
     observe_passes: float = 0.0
-    # A primitive is judged that was seen in this share of the steps between two controls, however seldom that is. Above
-    # 1 it takes several controls, and needs statistics that outlast them.
+    # A primitive is judged that was seen in this share of the steps between two controls, also where that is less often
+    # than `control.minimum_views`. Above 1 the latter decides: it takes several controls, and statistics outlast them.
     minimum_share: float = 2.0
     # An anchor in view less often, or in a smaller share of the steps between two controls, is not removed for its
     # opacity.
@@ -36,7 +36,15 @@ VARIANTS = {
     "default": Variant(),
     # Of 2 passes a fifth is less than 41 steps only with fewer than 103 views.
     "published": Variant(
-        5.0, 2.0, 3.0, 0.2, 1, 0.0, reset_all=True, finer_needs_coarser=True, entropy_steps=30_000
+        start_passes=5.0,
+        every_passes=2.0,
+        observe_passes=3.0,
+        minimum_share=0.2,
+        opacity_views=1,
+        opacity_share=0.0,
+        reset_all=True,
+        finer_needs_coarser=True,
+        entropy_steps=30_000,
     ),
     "scaffold-gs": Variant(opacity_views=1, opacity_share=0.8, finer_needs_coarser=True),
 }
