@@ -88,6 +88,8 @@ def say_expected(plan: "Plan", scene: "Scene", settings: RunSettings, device: st
     bytes_ = expected_bytes(plan.start)
     if asked is not None:
         say(f"file: {size(asked)}, as asked for")
+    elif scene.guessed:
+        say("file: size not known: points are found only as the run begins")
     elif bytes_ is None or settings.tiles is not None:
         say("file: size not known: no scene of about so many anchors has been measured")
     else:

@@ -28,9 +28,13 @@ USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 # A file of b bytes for each anchor at the given points comes of a lambda of about 0.04 / b^1.5: fitted to the default
 # preset's curves of docs/results (plush and brighton, 1 500 and 5 000 steps, lambda 0.0001 to 0.1). Sizes are met
 # within a factor of 2 (one standard deviation), at worst 3.5. Where points are looked for in the photographs, it is
-# about 0.1 / b^1.5: Truck, Bonsai, plush and the demo (lambda 0.001 to 0.01) are met within 1.7.
+# about 0.1 / b^1.5: Truck, Bonsai, plush and the demo (lambda 0.001 to 0.01) are met within 1.7. Where structure from
+# motion finds few points in large photographs, that is too small a lambda, and no rule minds.
 ONE_BYTE_LAMBDA, DENSE_ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 0.1, 1.5
-SIZED_ANCHORS = 1_000, 200_000  # at the given points, between which that is taken to hold
+# The size that people are told goes there by all anchors of the beginning. With lambda 0.002 each comes to 5 bytes on
+# average over seven captures, Truck to a mug on a table: 1.8 to 13, so within a factor of 2 mostly, at worst 2.8.
+DENSE_BYTES = 5.0
+SIZED_ANCHORS = 1_000, 250_000  # of the beginning, between which that is taken to hold
 # Anchors of the beginning from which on a capture is large: five bits more of each weight of the networks are less than
 # two bits of an anchor there, which has a hundred and more. More hidden units do not pay even there. What photographs
 # show counts, not only what structure from motion found: few points of large photographs left a few blurs
@@ -426,12 +430,12 @@ def lambda_for(bytes_per_anchor: float, *, dense: bool = False) -> float:
 
 
 def expected_bytes(start: Start) -> float | None:
-    """Bytes of the file, about: the inverse of `lambda_for`. None where it is not known."""
+    """Bytes of the file, about; None where that is not known."""
     fewest, most = SIZED_ANCHORS
-    if start.lmbda <= 0 or not fewest <= start.anchors <= most:
+    if start.lmbda <= 0 or not fewest <= start.beginning <= most:
         return None
-    one_byte = lambda_for(1.0, dense=start.dense)
-    return float(start.anchors * (one_byte / start.lmbda) ** (1 / SIZE_EXPONENT))
+    one_byte = USUAL_LAMBDA * DENSE_BYTES**SIZE_EXPONENT if start.dense else ONE_BYTE_LAMBDA
+    return float(start.beginning * (one_byte / start.lmbda) ** (1 / SIZE_EXPONENT))
 
 
 def active_rules(config: Config) -> tuple[Rule, ...]:
