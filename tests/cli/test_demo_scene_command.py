@@ -6,6 +6,7 @@ import pytest
 
 from compgs.cli.main import main
 from compgs.scene import load_scene
+from compgs.scene.doubt import cameras_from_elsewhere
 
 SMALL = ["--views", "3", "--width", "32", "--height", "24"]
 
@@ -20,6 +21,7 @@ def test_the_scene_can_be_loaded_and_replaced_on_request(tmp_path: Path) -> None
     assert first.train_views[0].image.shape == second.train_views[0].image.shape == (24, 32, 3)
     assert (first.train_views[0].image != second.train_views[0].image).any()
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+    assert not first.notes and not cameras_from_elsewhere(folder)  # its cameras are exact
 
 
 def test_a_folder_that_holds_more_than_a_scene_is_never_removed(

@@ -49,8 +49,8 @@ def test_frames_of_a_video_are_in_doubt_and_nothing_else_that_a_report_says(
     assert "video" in load_scene(folder).poses_in_doubt
 
 
-@pytest.mark.parametrize("report", ["reconstruction.json", "adjustment.json"])
-def test_before_and_after_a_training_cameras_are_worth_adjusting_unless_this_program_fitted_them(
+@pytest.mark.parametrize("report", ["reconstruction.json", "adjustment.json", "generated.json"])
+def test_before_and_after_a_training_cameras_are_worth_adjusting_unless_they_are_this_programs(
     write_capture: Callable[..., Path], capsys: pytest.CaptureFixture[str], report: str
 ) -> None:
     folder = write_capture()

@@ -75,7 +75,9 @@ class DemoScene(Command):
 
 def check_only_a_scene(folder: Path) -> None:
     """Raises OutputError if a folder that is to be replaced holds anything else than a generated scene."""
-    parts = [path for path in folder.glob("*") if path.name in ("images", "sparse", LOCK_NAME)]
+    from compgs.scene.doubt import GENERATED
+
+    parts = [path for path in folder.glob("*") if path.name in ("images", "sparse", GENERATED, LOCK_NAME)]
     others = [path for path in folder.glob("*") if path not in parts]
     others += [path for path in (folder / "images").glob("*") if not fnmatch(path.name, "view_*.png")]
     if others:

@@ -11,6 +11,7 @@ from compgs.scene.views import View
 
 REPORT = "reconstruction.json"  # of `compgs reconstruct`, in the scene's folder
 ADJUSTMENT = "adjustment.json"  # of `compgs adjust`
+GENERATED = "generated.json"  # of `compgs demo-scene`, whose cameras are exact
 MOST_ERROR = 1.0  # pixels of the photographs as they are read
 
 
@@ -27,9 +28,9 @@ def poses_in_doubt(folder: Path, capture: Capture, views: Sequence[View]) -> str
 
 
 def cameras_from_elsewhere(folder: Path) -> bool:
-    """Whether a COLMAP capture that `compgs adjust` reads came with cameras that this program did not fit."""
+    """Whether a COLMAP capture that `compgs adjust` reads has cameras that this program neither fitted nor computed."""
     adjustable = (folder / "images").is_dir() and (folder / "sparse" / "0").is_dir()
-    return adjustable and not any((folder / name).exists() for name in (REPORT, ADJUSTMENT))
+    return adjustable and not any((folder / name).exists() for name in (REPORT, ADJUSTMENT, GENERATED))
 
 
 def _of_a_video(report: Path) -> bool:

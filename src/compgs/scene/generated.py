@@ -13,9 +13,11 @@ from PIL import Image
 from compgs.cameras import Camera
 from compgs.errors import ConfigError, OutputError
 from compgs.numerics.rotations import quaternion_from_rotation, rigid
+from compgs.outputs import write_json
 from compgs.scene import ray_tracing as rt
 from compgs.scene.colmap import ColmapCamera, ColmapImage, ColmapPoints
 from compgs.scene.colmap_writer import write_sparse_model
+from compgs.scene.doubt import GENERATED
 
 POINTS = 8_000  # candidates; those seen by fewer than MIN_TRACK views are dropped
 MIN_TRACK = 3
@@ -30,7 +32,9 @@ def generate_scene(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,  # called with (done, total) views
 ) -> None:
-    """Writes `images/*.png` and `sparse/0/*.bin`; the same arguments give the same files.
+    """Writes `images/*.png`, `sparse/0/*.bin`, and `generated.json`, which says what was asked for.
+
+    The same arguments give the same files.
 
     The folder appears when it is complete. Raises OutputError if it exists and is not empty.
     """
@@ -73,6 +77,7 @@ def _write_scene(
     write_sparse_model(
         folder / "sparse" / "0", [ColmapCamera(1, "PINHOLE", width, height, params)], images, points
     )
+    write_json(folder / GENERATED, {"views": views, "width": width, "height": height, "seed": seed})
 
 
 def still_life(rng: np.random.Generator) -> rt.Solids:

@@ -9,10 +9,11 @@ from compgs.scene.colmap import count_images
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".jp2")
 # Files about a capture, not of it, by the beginning of their names.
 ABOUT = ("license", "licence", "readme", "copying", "notice", "citation")
-# What `compgs reconstruct`, `compgs adjust` and file managers leave. COLMAP 4 writes which cameras are mounted on which
-# rig; the poses of images hold all that a reader needs of it.
+# What `compgs reconstruct`, `adjust`, `demo-scene` and file managers leave. COLMAP 4 writes which cameras are mounted
+# on which rig; the poses of images hold all that a reader needs of it.
 BYPRODUCTS = (
-    *("reconstruction.json", "reconstruction.png", "adjustment.json", "thumbs.db", "desktop.ini"),
+    *("reconstruction.json", "reconstruction.png", "adjustment.json", "generated.json"),
+    *("thumbs.db", "desktop.ini"),
     *("rigs.bin", "frames.bin", "rigs.txt", "frames.txt"),
 )
 MOST_NAMED = 12
