@@ -64,7 +64,7 @@ def test_points_have_the_colors_of_the_photographs(folder: Path) -> None:
 def test_the_same_seed_gives_the_same_files(folder: Path, tmp_path: Path) -> None:
     generate_scene(tmp_path / "again", views=9, width=48, height=36)
     files = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
-    assert len(files) == 9 + 3
+    assert len(files) == 9 + 3 + 1  # photographs, the model, what was asked for
     assert all((folder / f).read_bytes() == (tmp_path / "again" / f).read_bytes() for f in files)
     generate_scene(tmp_path / "other", views=9, width=48, height=36, seed=1)
     image = Path("images") / "view_000.png"
