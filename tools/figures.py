@@ -49,6 +49,7 @@ FIRST = (
     "truck_adjusted_rate8",
     "truck_adjusted_1e-2",
     "truck_adjusted_4e-3",
+    "truck_adjusted_4e-4",
     "truck_adjusted_two_looks",
     "truck_adjusted_shallow",
     "truck_adjusted_whole",

@@ -128,6 +128,7 @@ def test_a_size_amounts_to_the_lambda_that_makes_such_files() -> None:
         "truck_adjusted_rate8",
         "truck_adjusted_1e-2",
         "truck_adjusted_4e-3",
+        "truck_adjusted_4e-4",
         "truck_adjusted_30000",
         "bonsai_default",
         "bonsai_rate8",
