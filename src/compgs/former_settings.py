@@ -58,9 +58,7 @@ FORMER = {
         None, "two networks predict at every lambda; --set model.heads=separate gives four"
     ),
     "model.sharp_where_many": _became_rule(0.002, "sharp"),
-    "model.networks_by_price": _became_rule(
-        True, "width_16", "width_8", "no_context", "one_bit_less", "two_bits_less"
-    ),
+    "model.networks_by_price": _became_rule(True, "width_16", "width_8", "no_context", "one_bit_less"),
     "model.voxel_rate_exponent": _of_rule(1 / 6, 0.0, "coarser_grid"),
     "control.rate_exponent": _of_rule(1 / 3, 0.0, "growth"),
     "control.prune_less": _of_rule(0.5, 0.0, "bit_discount"),
@@ -99,7 +97,7 @@ FORMER = {
 }
 # Former rules: a run that left one out is what every run is now. What `sampled_gradients` decided has the same name in
 # the plan of a run.
-FORMER_RULES = ("sampled_gradients", "own_residuals_many", "separate_heads")
+FORMER_RULES = ("sampled_gradients", "own_residuals_many", "separate_heads", "two_bits_less")
 # The former settings of `training` that `training.phases` holds now, in its order, with their defaults.
 PHASES = {
     "head_warm_up": 0.05,

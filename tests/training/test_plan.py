@@ -260,8 +260,8 @@ def test_the_networks_of_many_anchors_have_weights_of_more_bits() -> None:
 
 
 def test_bits_of_weights_follow_the_price_as_it_is_now() -> None:
-    found = [head_bits(Config(), USUAL, 1000 * price, 1000) for price in (1e-9, 3.1e-6, 3.1e-5)]
-    assert found == [7, 6, 5]
+    found = [head_bits(Config(), USUAL, 1000 * price, 1000) for price in (1e-9, 2.9e-6, 3.1e-6, 1e-4)]
+    assert found == [7, 7, 6, 6]
     pruned = replace(USUAL, findable=30_000)
     assert [head_bits(Config(), pruned, 1e-3, anchors) for anchors in (19_999, 20_000)] == [7, 12]
 

@@ -71,8 +71,8 @@ def test_bits_are_settled_once_the_networks_compute_with_them(blob_scene: Scene,
     assert trainer.model.head_bits == 7
     trainer.rate = replace(trainer.rate, lmbda=1.0)
     trainer.structure.follow(trainer.step, trainer.rate, stored=trainer.now.stored)
-    assert trainer.model.head_bits == 5
+    assert trainer.model.head_bits == 6
     trainer.step = int(priced.training.borders.weights * priced.training.steps)
     trainer.rate = replace(trainer.rate, lmbda=1e-9)
     trainer.structure.follow(trainer.step, trainer.rate, stored=trainer.now.stored)
-    assert trainer.model.head_bits == 5
+    assert trainer.model.head_bits == 6

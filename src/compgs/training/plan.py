@@ -244,12 +244,6 @@ RULES: tuple[Rule, ...] = (
         "results/decisions.md",
     ),
     Rule(
-        "two_bits_less", "head_bits", lambda c, s, bits: c.entropy.head_bits - 2,
-        "lambda / anchors of 3e-5 and more",
-        lambda s: s.costs(3e-5),
-        "results/decisions.md",
-    ),
-    Rule(
         "sharp", "dilation", lambda c, s, pixels: min(pixels, LEAST_DILATION),
         f"a point in {RATHER_FEW + 1} training views and more, and lambda up to {USUAL_LAMBDA:g}; or {DENSE}",
         lambda s: not s.few and (s.dense or s.lmbda <= USUAL_LAMBDA),
