@@ -14,8 +14,8 @@ LOOKED_AT = 16  # training views, spread evenly over all
 ALIKE = 12.0  # of 255, mean of the channels: light and noise change a color by so much
 FEWEST = 500  # points in these views, so that chance does not decide
 MOST_BY_CHANCE = 0.3  # of all pairs are alike: where a scene has one color, alikeness says nothing
-# Eight captures have 2.5 to 10 times as many as by chance. With exchanged photographs six of them have 1.0 to 1.5 times;
-# one whose photographs all look alike has 2.3 (docs/results/hasty_captures.md#photographs-of-other-cameras).
+# Eight captures have 2.5 to 10 times as many as by chance. With exchanged photographs six of them have 1.0 to 1.5
+# times; one whose photographs all look alike has 2.3 (docs/results/hasty_captures.md#photographs-of-other-cameras).
 LEAST_AGREEMENT = 1.8
 
 
