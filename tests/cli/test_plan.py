@@ -1,6 +1,7 @@
 """What a training says of its plan, and where it keeps it."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -37,16 +38,19 @@ def test_a_training_ends_with_four_lines_and_the_next_commands(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    scene = Path(shutil.copytree(scene, tmp_path / "elsewhere"))
+    (scene / "generated.json").unlink()  # a capture from elsewhere, whose cameras may be worth adjusting
     options = ["--steps", "4", "--device", "cpu", "--set", "model.max_anchors=60"]
     assert main(["train", str(scene), "-o", "run", *options]) == 0
     lines = capsys.readouterr().out.splitlines()
     first = next(i for i, line in enumerate(lines) if line.startswith("run/run.cgs: "))
     said = [line for line in lines[first:] if not line.startswith("evaluating views")]
-    assert len(said) == 6 and "dB" in said[1]
+    assert len(said) == 7 and "dB" in said[1]
     assert "run/contact_sheet.png" in said[2] and "run/results.json" in said[3]
     assert [line.split("#")[0].split() for line in said[4:]] == [
         ["next:", "compgs", "view", "run/run.cgs"],
         ["next:", "compgs", "export", "run/run.cgs", "run.html"],
+        ["next:", "compgs", "adjust", str(scene), "-o", f"{scene}_adjusted"],
     ]
 
 

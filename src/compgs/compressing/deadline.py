@@ -17,7 +17,7 @@ ENOUGH = 1_500
 LATE = 1.02  # of the time that is left: less is not worth passing over a step
 
 
-class PassesOver(Protocol):
+class SkipsSteps(Protocol):
     """A training whose steps need not all be learned in."""
 
     step: int
@@ -50,7 +50,7 @@ class Deadline:
             affordable = remaining * max(left, 0.0) / needed
             self._behind = remaining / max(affordable, fewest) - 1.0
 
-    def __call__(self, trainer: PassesOver) -> None:
+    def __call__(self, trainer: SkipsSteps) -> None:
         self.taken += 1
         self._owed += self._behind
         steps = min(math.floor(self._owed), self.steps - trainer.step - 1)

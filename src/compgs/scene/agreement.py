@@ -7,14 +7,15 @@ much more often colors are alike than between points and places that have nothin
 
 import numpy as np
 
-from compgs.scene.sight import places_in
+from compgs.numerics.evenly import evenly
+from compgs.scene.sight import inside, places_in
 from compgs.scene.views import Scene
 
 LOOKED_AT = 16  # training views, spread evenly over all
 ALIKE = 12.0  # of 255, mean of the channels: light and noise change a color by so much
 FEWEST = 500  # points in these views, so that chance does not decide
 MOST_BY_CHANCE = 0.3  # of all pairs are alike: where a scene has one color, alikeness says nothing
-# Eight captures have 2.5 to 10 times as many as by chance. With exchanged photographs six of them have 1.0 to 1.5
+# Eight captures have 2.5 to 10 times as many as by chance. With exchanged photographs six of them have 1.0 to 1.6
 # times; one whose photographs all look alike has 2.3 (docs/results/hasty_captures.md#photographs-of-other-cameras).
 LEAST_AGREEMENT = 1.8
 
@@ -27,12 +28,10 @@ def color_agreement(scene: Scene) -> float | None:
     if scene.guessed or not scene.train_views:
         return None
     chance = np.random.default_rng(0)
-    chosen = np.unique(np.linspace(0, len(scene.train_views) - 1, LOOKED_AT).round().astype(int))
     alike = by_chance = pairs = 0
-    for view in (scene.train_views[i] for i in chosen):
-        camera = view.camera
-        column, row, depth = places_in(camera, scene.points.positions)
-        there = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    for view in (scene.train_views[i] for i in evenly(len(scene.train_views), LOOKED_AT)):
+        column, row, depth = places_in(view.camera, scene.points.positions)
+        there = (depth > 0) & inside(view.camera, column, row)
         seen = view.image[row[there].astype(int), column[there].astype(int)].astype(np.float32)
         expected = scene.points.colors[there].astype(np.float32)
         alike += _alike(seen, expected)

@@ -14,11 +14,16 @@ def places_in(camera: Camera, positions: np.ndarray) -> tuple[np.ndarray, np.nda
     return camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy, depth
 
 
+def inside(camera: Camera, column: np.ndarray, row: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    """[P] bool: which places in pixels are in a camera's image, or beside it by at most a `margin` of its sides."""
+    across = (column > -margin * camera.width) & (column < (1 + margin) * camera.width)
+    down = (row > -margin * camera.height) & (row < (1 + margin) * camera.height)
+    return np.asarray(across & down)
+
+
 def depths_in(camera: Camera, positions: np.ndarray, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Distances [P] of positions [P, 3] along the camera's axis, world units; [P] bool: which are in its image, or
     beside it by at most a `margin` of its sides.
     """
     column, row, depth = places_in(camera, positions)
-    across = (column > -margin * camera.width) & (column < (1 + margin) * camera.width)
-    down = (row > -margin * camera.height) & (row < (1 + margin) * camera.height)
-    return depth, (depth > 0) & across & down
+    return depth, (depth > 0) & inside(camera, column, row, margin)

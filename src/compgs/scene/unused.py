@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from compgs.scene.colmap import count_images
+from compgs.scene.doubt import ADJUSTMENT, GENERATED, REPORT
 
 # Of photographs, also those that cannot be read.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".jp2")
@@ -12,7 +13,7 @@ ABOUT = ("license", "licence", "readme", "copying", "notice", "citation")
 # What `compgs reconstruct`, `adjust`, `demo-scene` and file managers leave. COLMAP 4 writes which cameras are mounted
 # on which rig; the poses of images hold all that a reader needs of it.
 BYPRODUCTS = (
-    *("reconstruction.json", "reconstruction.png", "adjustment.json", "generated.json"),
+    *(REPORT, "reconstruction.png", ADJUSTMENT, GENERATED),
     *("thumbs.db", "desktop.ini"),
     *("rigs.bin", "frames.bin", "rigs.txt", "frames.txt"),
 )

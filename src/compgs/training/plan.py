@@ -29,7 +29,8 @@ USUAL_LAMBDA, LAMBDA_RANGE = 0.002, (1e-6, 0.1)
 # preset's curves of docs/results (plush and brighton, 1 500 and 5 000 steps, lambda 0.0001 to 0.1). Sizes are met
 # within a factor of 2 (one standard deviation), at worst 3.5. Where points are looked for in the photographs, it is
 # about 0.1 / b^1.5: Truck, Bonsai, plush and the demo (lambda 0.001 to 0.01) are met within 1.7. Where structure from
-# motion finds few points in large photographs, that is too small a lambda, and no rule minds.
+# motion finds few points in large photographs, that is too small a lambda, and no rule minds. By all anchors of the
+# beginning it would be too large where files are small: 0.07 for 15 kB of plush, which 0.014 gives, and half the units.
 ONE_BYTE_LAMBDA, DENSE_ONE_BYTE_LAMBDA, SIZE_EXPONENT = 0.04, 0.1, 1.5
 # The size that people are told goes there by all anchors of the beginning. With lambda 0.002 each comes to 5 bytes on
 # average over seven captures, Truck to a mug on a table: 1.8 to 13, so within a factor of 2 mostly, at worst 2.8.
